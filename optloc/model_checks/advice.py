@@ -150,7 +150,7 @@ def misfit_of(problem: Problem, x: Array) -> str:
 def _bias_of_run(problem: Problem, candidate: Candidate) -> Bias:
     """Return the bias of a candidate over all rows of a run; the test used only some of the rows.
 
-    A step or burst affects only the rows between its start and its end.
+    A step or burst affects only the rows between its start and its end. A step has the end NaN, which no time reaches.
     """
     members = (candidate.bias.members[0],) if candidate.per == "station" else None
     rows, names, kind = problem.rows, problem.stations.names, candidate.kind or None
@@ -190,6 +190,7 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
         return problem, x
     kept = max(2, int(problem.epochs * _MAX_ROWS / problem.count))
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
+    # omit epochs without rows
     chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
     local = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
@@ -200,7 +201,7 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
     """Return the problem without values that are not finite and without epochs that have no fix, and a finite vector.
 
     These rows stay in the arrays with weight zero. In the vector (1, size), an epoch without a fix gets the mean of the
-    local unknowns of the other epochs.
+    local unknowns of the other epochs. `x` (1, size) is the vector before.
     """
     weight = np.where(np.isfinite(problem.z), problem.weight, 0.0)
     n, length = problem.layout.n_shared, problem.layout.n_local

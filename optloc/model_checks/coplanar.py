@@ -72,6 +72,7 @@ class Across:
         """Return a flat batch of N problems with coplanar stations in the coordinates of their plane."""
         count = problem.batch_shape[0]
         centre, axes, _, size = plane_of_stations(problem)
+        # the normal, the first column, becomes the last
         centre, axes = np.broadcast_to(centre, (count, centre.shape[-1])), axes[..., ::-1]
         axes = np.broadcast_to(axes, (count, *axes.shape[-2:]))
         place = (problem.stations.position - centre[:, None, None]) @ axes[:, None]
@@ -162,6 +163,7 @@ def is_coplanar(problem: Problem) -> Array:
     count = problem.batch_shape[0]
     if not is_symmetric(problem):
         return np.zeros(count, dtype=bool)
+    # `off` is the largest distance of a station from the plane, `size` the largest distance from the centre, m
     _, _, off, size = plane_of_stations(problem)
     return np.broadcast_to(off <= np.maximum(_COPLANAR * size, _NOISE_SHARE * _noise(problem)), (count,))
 
@@ -229,8 +231,9 @@ def distance_from_plane(problem: Problem, fix: Fix, level: float = 0.95) -> tupl
 def information_in_square(across: Across, x: Array) -> tuple[Array, Array]:
     """Return the information (N, n, n) on the n shared unknowns, and a mask (N,) of its existence.
 
-    The unknown w, the distance from the plane, is replaced by q = w^2. `x` (N, size) is in plane coordinates. The mask
-    is False if the local unknowns of the only epoch are not determined.
+    The unknown w, the distance from the plane, is replaced by q = w^2: derivatives by q are derivatives by w divided by
+    2 w. A distance w of zero is increased to `across.least`. `x` (N, size) is in plane coordinates. The mask is False
+    if the local unknowns of the only epoch are not determined.
     """
     axis = across.part.stop - 1
     start = np.array(x)
@@ -246,11 +249,14 @@ def interval_across(across: Across, x: Array, cost: Array, level: float = REGION
     """Return the ends (N,) of the interval of the distance from the plane, by the profile of the cost.
 
     `x` (N, size) are the fixes in plane coordinates and `cost` (N,) their costs. Both ends are in metres. The upper end
-    is infinite if no distance up to a million spreads of the stations has a high enough cost.
+    is infinite if no distance up to a million spreads of the stations has a high enough cost. The lower end is zero if
+    the cost on the plane is low enough. `level` is the probability of the interval.
     """
     rise, w = quantile(level, 1), x[:, across.part.stop - 1]
     sigma = _spread_of_square(across, x)
     _, on_plane = across.profile(x, across.least)
+    # The lower end is above zero only if the cost on the plane is too high. `ends` are q and cost of the fix, then of a
+    # point with a higher cost. A quadratic cost reaches the limit sqrt(rise) standard deviations from the fix.
     off_plane, low = np.flatnonzero(on_plane - cost > rise), np.zeros(len(x))
     if len(off_plane):
         least = across.least[off_plane] ** 2
@@ -280,7 +286,8 @@ def _spread_of_square(across: Across, x: Array) -> Array:
 def _bracket(across: Across, x: Array, top: Array, sigma: Array) -> tuple[Array, Array]:
     """Return distances (N,) from the plane, m, whose profile cost exceeds the limit `top` (N,), and these costs (N,).
 
-    A distance is infinite if the cost stays below the limit at all tried distances. `x` (N, size) are the fixes in
+    These distances are start values for a search of the upper end. A distance is infinite if the cost stays below the
+    limit at all tried distances. `x` (N, size) are the fixes in
     plane coordinates, and `sigma` (N,) the standard deviations of q, m^2.
     """
     # one step is enough if the cost is quadratic in q
@@ -308,7 +315,8 @@ def _crossing(across: Across, x: Array, rise: float, ends: tuple[Array, ...], fi
     ----------
     M. Dowell and P. Jarratt, "A modified regula falsi method for computing the root of an equation", BIT 11 (1971).
     """
-    # a and b are the ends of the search in q; low and high are the excesses of the root of the rise there
+    # a and b are the ends of the search in q; low and high are the excesses of the root of the rise there. side is 1
+    # after a change of b, -1 after a change of a, and 0 at the start.
     a, least, b, above = ends
     root_rise = np.sqrt(rise)
     low, high, side = np.full(len(x), -root_rise), np.sqrt(above - least) - root_rise, np.zeros(len(x))

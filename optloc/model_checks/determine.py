@@ -105,15 +105,16 @@ def _determined_of_problem(flat: Problem, dof: int) -> Determined:
     axes, line = plane_of_stations(flat)[1][0], _about_line(flat)
     if line is not None:
         return Determined(surface.centre, level, north, (), _along_line(line), axis=axes[:, -1])
+    # `outside` states that the result assumes a target outside the sphere of the stations
     outside, (name, curve, numbers) = False, _curve(flat)
     if curve is not None:
         return Determined(surface.centre, level, north, (), numbers, curve, name)
-    found = directions_of(surface, level, dof < 0) if dof >= _MIN_DOF else ()
+    found = directions_of(surface, level, few=dof < 0) if dof >= _MIN_DOF else ()
     if dof >= 0 and not found:
         # between the stations any direction is possible: consider only targets outside their sphere
         found = directions_of(replace(surface, most=1.0), level)
         outside = bool(found)
-    # if the range is unbounded, the distance from a plane is unbounded too
+    # `mixed` means that the range has an upper limit; without a limit, the distance from a plane has none either
     closed = not outside and all(one.mixed for one in found)
     across = _in_plane(flat, surface) if closed and is_coplanar(flat)[0] else ()
     axis = axes[:, 0] if across else None
@@ -126,13 +127,15 @@ def _determined_of_problem(flat: Problem, dof: int) -> Determined:
 def _about_line(flat: Problem) -> Problem | None:
     """Return the problem in a plane through the line of all stations, or None if the stations are on no line in space.
 
-    In the plane, the stations are on the x axis and do not move.
+    In the plane, the stations are on the x axis and do not move. The result is also None if all stations are at one
+    point.
     """
     if flat.dimension != 3 or not is_coplanar(flat)[0]:
         return None
     centre, axes, _, size = plane_of_stations(flat)
     if size[0] == 0.0:
         return None
+    # columns of the axes: number 2 is along the line, number 1 perpendicular to it
     in_plane = (flat.stations.position - centre[0]) @ axes[0][:, [2, 1]]
     no_velocity = None if flat.stations.velocity is None else np.zeros((1, flat.stations.count, 2))
     stations = replace(flat.stations, position=in_plane, velocity=no_velocity, axes=None)
@@ -159,6 +162,7 @@ def _along_line(problem: Problem) -> tuple[Quantity, ...]:
         extent_of(surface, minima.u[i], float(minima.v[i]), float(minima.cost[0]), rise) for i in range(len(minima.v))
     ]
     points = np.concatenate(found)
+    # a region on both sides of the line contains points of the line: distance 0, and angle 0 or pi
     crosses = any((edge[:, 1] > 0.0).any() and (edge[:, 1] < 0.0).any() for edge in found)
     angle = np.abs(np.arctan2(points[:, 1], points[:, 0]))
     turn = abs(float(np.arctan2(minima.u[0, 1], minima.u[0, 0])))
@@ -197,7 +201,7 @@ def _in_plane(flat: Problem, surface: DirectionCost) -> tuple[Quantity, ...]:
     """
     if (flat.weight > 0.0).sum() < flat.dimension:
         return ()
-    minima = minima_of(surface, 0.0)
+    minima = minima_of(surface, rise=0.0)  # only the lowest minimum
     if not np.isfinite(minima.cost[0]) or minima.v[0] <= INFINITY:
         return ()
     across = Across.of(flat)
@@ -207,6 +211,7 @@ def _in_plane(flat: Problem, surface: DirectionCost) -> tuple[Quantity, ...]:
     if not ok[0] or not np.isfinite(high[0]):
         return ()
     part, d = across.part, flat.dimension
+    # the last coordinate is the distance from the plane; its interval comes from the cost, not from the covariance
     place, inner = x[0, part], spread[0, part, part][:-1, :-1]
     name = "distance from plane" if d == 3 else "distance from line"
     far = Quantity(name, float(place[-1]) if place[-1] > across.least[0] else 0.0, float(low[0]), float(high[0]), "m")
@@ -220,6 +225,7 @@ def _coordinates(across: Across, place: Array, covariance: Array) -> tuple[Quant
     the frame if enough of these are in the plane, else along the principal axes of the stations.
     """
     centre, axes = across.centre[0], across.axes[0]
+    # axes of the frame that are perpendicular to the normal of the plane
     level = np.flatnonzero(np.abs(axes[:, -1]) <= _IN_PLANE)
     if len(level) == len(place):
         names, turn, start = ["xyz"[i] for i in level], axes[level, :-1], centre[level]
@@ -269,6 +275,7 @@ def _hyperbola(a: Array, b: Array, z: float) -> Array:
     along = (b - a) / base
     if abs(z) >= base:
         return np.stack([b, b + _REACH * base * along] if z > 0.0 else [a, a - _REACH * base * along])
+    # semi-axes: `vertex` along the baseline (with the sign of z), and `side` across
     vertex, side = 0.5 * z, np.sqrt(0.25 * base**2 - 0.25 * z**2)
     turn = np.linspace(-1.0, 1.0, _POINTS) * np.arcsinh(_REACH * base / side)
     # for z > 0 the branch is nearer to b
@@ -277,7 +284,10 @@ def _hyperbola(a: Array, b: Array, z: float) -> Array:
 
 
 def _ellipse(a: Array, b: Array, total: float) -> Array:
-    """Return points (k, 2) with a given sum of distances from a and b, m; the segment a-b if the sum is too small."""
+    """Return points (k, 2) with a given sum of distances from a and b, m; the segment a-b if the sum is too small.
+
+    `total` is the sum, and `a` and `b` (2,) are the positions of the stations, m.
+    """
     base = float(np.hypot(*(a - b)))
     along = (b - a) / base if base > 0.0 else np.array([1.0, 0.0])
     if total <= base:
@@ -315,7 +325,8 @@ def of_fix(fix: Fix) -> Determined | None:
 def _interval(fix: Fix, axis: Extent) -> tuple[float, float]:
     """Return the 95 % interval of a coordinate ("x", "y" or "z") of a fix, m.
 
-    If bounds truncate the distribution, it is the shortest interval, else plus and minus 1.96 sigma.
+    If bounds truncate the distribution, it is the shortest interval, else plus and minus 1.96 sigma. `axis` is the name
+    of the coordinate.
     """
     if fix.chart is not None and fix.chart.cut_off:
         low, high = fix.interval(axis)

@@ -80,7 +80,7 @@ class DirectionCost:
     - x (1, size): start of the search for the other unknowns.
     - centre (d,): centre of the stations with present rows, m.
     - spread: largest distance of these stations from the centre, m; 1 for one station.
-    - weighed (1, size): parameters at which station errors are weighted; None weights each position at this position.
+    - weighed (1, size): parameters at which the noise of station errors is computed; None computes it at each position.
     - most: largest inverse range of the search, in 1/spread.
     """
 
@@ -117,7 +117,8 @@ class DirectionCost:
         """
         x = self.vectors(u, v)[:, None]
         method = profile_by_rows if has_scales(self.problem) else profile
-        cost, information, vector = method(self.problem, x, x if self.weighed is None else self.weighed, 2)
+        cost, information, vector = method(self.problem, x, x if self.weighed is None else self.weighed, passes=2)
+        # derivative of the position by the d changes, which converts the equations of the position
         away = self.spread * u
         gradient = jacobian(np.concatenate([0.0 * u[:, :-1], v[:, None]], axis=1), away, np.zeros(u.shape[1]))
         turned = np.swapaxes(gradient, -1, -2)
@@ -149,7 +150,8 @@ class DirectionCost:
     def _moved(self, u: Array, v: Array, move: Array) -> tuple[Array, Array]:
         """Return directions (q, d) and inverse ranges (q,) after steps (q, d): d - 1 rotations, rad, and a change of v.
 
-        A rotation is at most `_TURN`, and an inverse range stays within its bounds.
+        A rotation is at most `_TURN`, and an inverse range stays within its bounds. `u` (q, d) and `v` (q,) are the
+        starts, and `move` (q, d) are the steps.
         """
         turn = move[:, :-1]
         length = np.sqrt((turn**2).sum(-1, keepdims=True))
@@ -171,10 +173,11 @@ class DirectionCost:
     def best_range(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the best inverse ranges (q,) of directions `u` (q, d) and their costs (q,).
 
-        Each direction has three starts: its guess in `v` (q,), infinity, and a point near the stations.
+        Each direction has three starts: its guess in `v` (q,), infinity, and a point near the stations. The directions
+        do not change.
         """
         starts = np.concatenate([v, np.full(len(v), INFINITY), np.full(len(v), _NEAR_STATIONS)])
-        _, found, cost = self.descend(np.tile(u, (3, 1)), starts, False, True, _FEW)
+        _, found, cost = self.descend(np.tile(u, (3, 1)), starts, rotate=False, change_range=True, steps=_FEW)
         found, cost = found.reshape(3, -1), cost.reshape(3, -1)
         best = cost.argmin(0)[None]
         return np.take_along_axis(found, best, 0)[0], np.take_along_axis(cost, best, 0)[0]
@@ -189,9 +192,10 @@ def _step(information: Array, vector: Array, damping: Array, free: Array) -> tup
     inner = np.where(free[:, :, None] & free[:, None, :], information, 0.0)
     right = np.where(free, vector, 0.0)
     size = np.diagonal(inner, axis1=-2, axis2=-1).copy()
-    # both rotations have one scale: on the plane of the stations, the derivative across the plane is zero
+    # damping: both rotations have one scale: on the plane of the stations, the derivative across the plane is zero
     size[:, :-1] = size[:, :-1].max(-1, keepdims=True)
     size = np.where(free & (size > 0.0), size, np.maximum(size.max(-1, keepdims=True), 1e-300))
+    # a fixed coordinate gets a diagonal entry only, so that the system stays solvable
     grown = inner + (damping[:, None] * size + np.where(free, 0.0, size))[..., None] * np.eye(size.shape[-1])
     move, ok = linalg.solve(grown, right[..., None])
     move = np.where(free & ok[:, None], move[..., 0], 0.0)
@@ -253,8 +257,8 @@ def _distinct(u: Array, v: Array, cost: Array, rise: float) -> DirectionMinima:
 
 # Edges: points where the square root of the rise of the cost reaches a given value.
 
-# Function of arguments (k,) and guesses (k,) of the minimised unknown; it returns the excess of the root and the
-# optimal unknown.
+# Function of arguments (k,) and guesses (k,) of the minimised unknown. It returns two arrays (k,): the square root of
+# the rise minus its value at the edge (the excess), and the optimal unknown.
 Profile = Callable[[Array, Array], tuple[Array, Array]]
 
 
@@ -267,6 +271,7 @@ def edge(
     the direction, one for each ray. `least` is the lowest cost of all minima, and `rise` (k,) the rise of the cost at
     the edge. The results are NaN for a ray whose cost stays lower up to the widest angle.
     """
+    # low is inside the cone and high is tried; below and above are the excesses there
     u0, v0 = start
     wanted, v = np.sqrt(rise), np.full(len(rays), v0)
     low, high, above = np.zeros(len(rays)), _gaussian_edge(surface, u0, v0, rays, wanted), np.zeros(len(rays))
@@ -341,7 +346,8 @@ def ends_of_range(surface: DirectionCost, minima: DirectionMinima, least: float,
     """Return the smallest and largest inverse range near minima with a low enough cost, in 1/spread.
 
     The cost is a profile over the inverse range: the directions adapt to each inverse range. An inverse range belongs
-    to the interval if its cost is at most `rise` above `least`.
+    to the interval if its cost is at most `rise` above `least`. A lower end of `INFINITY` means infinity, and an upper
+    end of `surface.most` the nearest point of the search.
     """
     wanted, count = np.sqrt(rise), len(minima.v)
     # all ends together: lower ends with the sign changed, so that each search goes upwards
@@ -349,9 +355,9 @@ def ends_of_range(surface: DirectionCost, minima: DirectionMinima, least: float,
     low, limit = side * np.tile(minima.v, 2), np.where(side > 0.0, surface.most, -INFINITY)
 
     def at(inverse: Array, _: Array) -> tuple[Array, Array]:
-        # excess of the root of the rise at inverse ranges; the directions start at the last good ones
+        # excess of the root of the rise at inverse ranges; the directions start where the cost was last low enough
         nonlocal state
-        there, _, cost = surface.descend(state, side * inverse, True, False, _FEW)
+        there, _, cost = surface.descend(state, side * inverse, rotate=True, change_range=False, steps=_FEW)
         state = np.where((cost <= least + rise)[:, None], there, state)
         return _sigmas_above(cost, least) - wanted, inverse
 
@@ -377,21 +383,24 @@ def directions_of(surface: DirectionCost, level: Array, few: bool = False) -> tu
 
     The result is empty if there is no minimum, a cone has no closed edge, or more than `_CONES` cones are necessary.
     `level` (d, d) has two horizontal axes and, in space, the vertical axis as rows. `few` means fewer rows than
-    unknowns: separate minima are then points of a valley, and no cone is traced.
+    unknowns. If many minima are then far apart, they are points of a valley, and the result is empty.
     """
     d = len(surface.centre)
     rise, single = quantile(LEVEL, d - 1), quantile(LEVEL, 1)
     minima = minima_of(surface, rise)
     if depends_on_place(surface.problem):
+        # compute the noise of station errors at the best minimum, so that the same noise applies to the whole cone
         surface = replace(surface, weighed=surface.vectors(minima.u[:1], minima.v[:1]))
         minima = minima_of(surface, rise)
     if not np.isfinite(minima.cost[0]) or (few and _is_valley(minima.u)):
         return ()
+    # each cone is found with the numbers of the minima inside it
     least, found = float(minima.cost[0]), list[tuple[Direction, list[int]]]()
     for i, u in enumerate(minima.u):
         around, members = next(((cone, items) for cone, items in found if cone.covers(u)), (None, [i]))
         if around is not None:
             members.append(i)
+            # a minimum inside a known cone needs a separate cone only if it is a mirror image
             if not _is_image(surface, around.vector, u):
                 continue
         cone = _cone(surface, minima, i, np.array([rise, single]), level)
@@ -415,7 +424,7 @@ def _is_valley(u: Array) -> bool:
 def _is_image(surface: DirectionCost, one: Array, other: Array) -> bool:
     """Return whether two different directions (d,) are mirror images in the plane of the stations.
 
-    Two touching cones of mirror images have a waist, so rays from one of them miss much of the other.
+    Two touching cones of mirror images are narrow where they touch, so rays from one of them miss much of the other.
     """
     image = mirror(surface.problem, (surface.centre + one)[None])[0] - surface.centre
     return bool(np.abs(image - other).max() < _ALIKE and np.abs(image - one).max() > _ALIKE)
@@ -425,9 +434,10 @@ def _cone(surface: DirectionCost, minima: DirectionMinima, i: int, rises: Array,
     """Return the cone about minimum number `i` without its range, or None if the set has no closed edge.
 
     `rises` (2,) are the rises of the cost at the edge of the cone, and at the ends of azimuth and elevation. `level` is
-    as in `directions_of`.
+    as in `directions_of`. The range is set to (infinity, 0, infinity); `_with_range` replaces it.
     """
     u, v, least = minima.u[i], minima.v[i], float(minima.cost[0])
+    # a minimum above a rise is outside the set of this rise: its edge is then the minimum itself
     usable, across = rises > minima.cost[i] - least, _principal(surface, minima.u[i], minima.v[i])
     sides = np.concatenate([across.T, -across.T])
     reach, _ = edge(surface, (u, v), sides, least, np.full(len(sides), rises[0]))
@@ -516,8 +526,9 @@ def _with_range(
 ) -> Direction:
     """Return a cone with its range (best, smallest, largest) in m, from the inverse ranges of the minima in the cone.
 
-    `least` is the lowest cost of all minima, and `rise` the rise at the ends of the range. If no minimum in the cone is
-    within this rise, the minimum with the lowest cost is used.
+    `minima` are in the cone, `least` is the lowest cost of all minima, and `rise` the rise at the ends of the range. If
+    no minimum in the cone is within this rise, the minimum with the lowest cost is used. Infinity as an end means no
+    upper limit.
     """
     near = minima[minima.cost <= least + rise]
     if not len(near.cost):

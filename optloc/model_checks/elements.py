@@ -105,11 +105,13 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
     """
     ends = ends_of(problem, by)
     names = sorted({*ends.name.ravel().tolist()} - {""})
+    # one sigma for all parts, so that the size of a shared error does not depend on the division into parts
     size = typical_sigma(problem, common) if common else {}
     parts = []
     for first in range(0, len(x), _BATCH):
         items = np.arange(first, min(first + _BATCH, len(x)))
         parts.append(_part(problem.take(items), x[items], by, (common, size)))
+    # groups of shared errors, and groups of correlated rows, come after the groups of single rows
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
 
@@ -117,7 +119,8 @@ def elements(problem: Problem, x: Array, by: By, common: By | None = None) -> El
 def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str, float]]) -> Elements:
     """Return the elements of a part of a batch at the fixes `x` (n, size).
 
-    `common` is the grouping of the shared errors, or None, and the sigma of each group (see `elements`).
+    `common` is the grouping of the shared errors, or None, and the sigma of each group (see `elements`). `by` selects
+    the groups, see `ends_of`.
     """
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
@@ -129,6 +132,7 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
         effect = np.concatenate([effect, np.broadcast_to(more, (count, *more.shape))], axis=-1)
         sigma = np.concatenate([sigma, np.broadcast_to(size, (count, len(size)))], axis=-1)
         error_names = np.concatenate([error_names, more_names])
+    # the empty name, for no group, has the number -1
     offset, offset_names = _offsets(problem, by)
     names = tuple(sorted({*error_names.tolist(), *offset_names.tolist()} - {""}))
     number = {name: i for i, name in enumerate(names)} | {"": -1}
@@ -156,7 +160,11 @@ def _part(problem: Problem, x: Array, by: By, common: tuple[By | None, dict[str,
 
 
 def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return residuals (N, m) and Jacobians (N, m, p) along the directions that equality constraints leave free."""
+    """Return residuals (N, m) and Jacobians (N, m, p) at the vectors `x` (N, size).
+
+    The columns of a Jacobian are all shared unknowns and the local unknowns of each epoch. With equality constraints,
+    columns along the constraints replace the columns of the shared unknowns.
+    """
     residual, jacobian = differentiate(problem, x)
     if problem.epochs > 1 and problem.layout.n_local:
         n, length = problem.layout.n_shared, problem.layout.n_local
@@ -201,7 +209,8 @@ def _paths(problem: Problem, x: Array, residual: Array) -> Array:
 def _effects(problem: Problem, by: By, present: Array) -> tuple[Array, Array, Array]:
     """Return the effects (N, m, q) of all errors, the group names (q,) and the standard deviations (N, q).
 
-    `present` (N, m) marks rows with a weight above zero. Effects and deviations are in the units of the rows.
+    `present` (N, m) marks rows with a weight above zero. Effects and deviations are in the units of the rows. `by`
+    selects the groups, see `ends_of`.
     """
     count, rows = present.shape
     effects, names, sigmas = [], [], []
@@ -231,7 +240,11 @@ def common_name(name: str) -> str:
 
 
 def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
-    """Return the stated standard deviation of the rows of each group: the root mean square over all problems."""
+    """Return the stated standard deviation of the rows of each group: the root mean square over all problems.
+
+    The result is a dictionary by the name of the group, in the units of the rows. A group without present rows is
+    omitted.
+    """
     variance = np.broadcast_to(variances(problem.noise, problem.count), (problem.batch_shape[0], problem.count))
     weight, ends = np.broadcast_to(problem.weight > 0.0, variance.shape), ends_of(problem, by).name
     found = {}
@@ -261,7 +274,10 @@ def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Ar
 
 
 def _ungrouped_noise(problem: Problem, x: Array) -> Array:
-    """Return the covariance (N, m, m) that station errors and weights between 0 and 1 add to the noise."""
+    """Return the covariance (N, m, m) that station errors and weights between 0 and 1 add to the noise.
+
+    The effect of station errors is computed at the fixes `x` (N, size).
+    """
     rows = np.arange(problem.count)[None]
     stated = gathered(problem.noise, rows)[..., 0, :, :]
     whole = gathered(with_station_noise(problem, x).noise, rows)[..., 0, :, :]
@@ -294,13 +310,18 @@ def _pack(columns: Array, number: Array) -> tuple[Array, Array, Array]:
 
 
 def _with_priors(problem: Problem, x: Array, packed: Elements) -> Elements:
-    """Return the elements with additional rows for the priors of the problem; these rows belong to no group."""
+    """Return the elements with additional rows for the priors of the problem; these rows belong to no group.
+
+    `x` (N, size) are the fixes. An additional row is the mean of a prior minus the unknown at the fix. With equality
+    constraints, no rows are added.
+    """
     # With equality constraints, priors are omitted: their columns on the tangent space are not unit vectors, and the
     # constraint is stronger than the prior.
     parts = [] if exact(problem) else prior_parts(problem)
     for name, mean, precision in parts:
         slot, shared = problem.layout.find(name)
         start = slot.start if shared else problem.layout.n_shared + slot.start
+        # a prior is a row that measures its unknowns directly
         columns = start + np.arange(slot.size)
         more = np.zeros((len(x), slot.size, packed.jacobian.shape[-1]))
         more[:, np.arange(slot.size), columns] = 1.0
@@ -383,7 +404,7 @@ def ends_of(problem: Problem, by: By) -> Ends:
 def _ends(problem: Problem, kind: str, a: Array, b: Array, by: By) -> tuple[Array, Array]:
     """Return the group names and signs (m, 2) of rows of one kind with the station numbers `a` and `b` (m,).
 
-    The signs are as in `Ends`, before the sense of compass bearings is applied.
+    The signs are as in `Ends`, before the sense of compass bearings is applied. `by` selects the groups, see `ends_of`.
     """
     name, sign = np.full((len(a), 2), "", dtype=object), np.zeros((len(a), 2))
     model = MODELS[kind]
@@ -436,7 +457,8 @@ def split(problem: Problem, block: Block, by: By, present: Array) -> tuple[Array
 
     The block has g groups of r rows; `present` (..., m) marks rows with a weight above zero. The results are the
     effects (..., g, r, q), the names (g, q) of the groups, and the stated standard deviations (..., g, q). Effects and
-    deviations are in the units of the rows, and ``effect @ effect'`` is the covariance of the present rows.
+    deviations are in the units of the rows, and ``effect @ effect'`` is the covariance of the present rows. `by`
+    selects the groups, see `ends_of`.
     """
     _g, r = block.row.shape
     if r == 1:
@@ -469,7 +491,8 @@ def _arrivals(
     """Return the noise of groups of rows (g, r) as errors of arrivals, plus errors of the rows if necessary.
 
     `row` are the row numbers, `covariance` (..., g, r, r) the noise, and `here` (..., g, r) marks present rows. The
-    results are as in `split`. Return None if the covariance does not have this form.
+    results are as in `split`. Return None if the covariance does not have this form. `by` selects the groups, see
+    `ends_of`.
     """
     ends = ends_of(problem, "station")
     kind = str(kinds_of(problem)[row[0, 0]])
@@ -477,6 +500,7 @@ def _arrivals(
     # D: the sign with which the arrival at each station (columns) enters each row.
     design = ((ends.name[row][..., None] == labels) * ends.sign[row][..., None]).sum(-2) * here[..., None]
     single = np.eye(row.shape[1]) * here[..., None]
+    # the group of each arrival: its station, or the kind of the rows
     groups = labels if by == "station" else np.full(len(labels), kind, dtype=object)
     # Try arrivals alone first, then arrivals and errors of the rows. If neither fits, the correlation has another form.
     for parts, names in (

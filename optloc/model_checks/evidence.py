@@ -51,7 +51,7 @@ class Influence:
     - shared (q, n): S of the shared unknowns.
     - local (q, l): T of the unknowns of each epoch.
     - epoch (q,): epoch of each row; -1 for priors.
-    - prior: the rows of each prior by its number.
+    - prior: for the number of each prior, the numbers of the rows that it adds.
     - deviation (n, n): a square root of the covariance of the shared unknowns.
     """
 
@@ -140,6 +140,7 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     # whitening is applied to neither: Q needs P and J separately
     linear, equations = linearise(problem, x), equations_at(problem, x)
     selections, means, prior_precisions = _prior_rows(problem)
+    # first row number of each prior: priors come after the m rows
     cuts = np.cumsum([problem.count, *(len(pick) for pick in selections)])
     prior_count = int(cuts[-1]) - problem.count
     present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)
@@ -147,6 +148,7 @@ def influences(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()
     prior_residuals = [mean - x[:, :n] @ pick.T for mean, pick in zip(means, selections, strict=True)]
     residual = np.concatenate([np.where(present, linear.residual, 0.0), *prior_residuals], axis=1)
     picked = (np.broadcast_to(pick, (size, *pick.shape)) for pick in selections)
+    # derivatives of all rows by the shared unknowns (A) and by the local unknowns of their epoch (B)
     A = np.concatenate([linear.shared, *picked], axis=1)
     B = np.concatenate([linear.local, np.zeros((size, prior_count, layout.n_local))], axis=1)
     epoch = np.concatenate([problem.epoch, np.full(prior_count, -1)])
@@ -189,10 +191,12 @@ def _precisions(linear: Linear, count: int, prior_precisions: Sequence[Array], s
     """Return the inverse covariances (q, q) of the rows and priors of each problem; absent rows are zero.
 
     `count` is the number of rows without priors, `prior_precisions` the precisions of the priors, and `size` the number
-    of problems. The result is dense for few rows and sparse for many rows.
+    of problems. The result is dense for few rows and sparse for many rows. `linear` are the linearised rows with their
+    whitening matrices.
     """
     parts = []
     for whitener in linear.noise:
+        # with a whitening matrix W, the inverse covariance is W'W
         weights = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
         g, r = whitener.row.shape
         weights = np.broadcast_to(weights, (size, g, r, r)).reshape(size, -1)
@@ -217,6 +221,7 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
 
     The products of the factors with their transposes sum to J (J'P J)^-1 J', the second only within each epoch. `A` (N,
     q, n) and `B` (N, q, l) are the derivatives by shared and local unknowns, and `epoch` (q,) is -1 for priors.
+    `equations` are the normal equations of the problems.
     """
     information, _, _ = marginal(equations)
     root, _ = linalg.root(information)
@@ -232,8 +237,9 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
 def log_tail(statistic: Array, dof: Array) -> Array:
     """Return the logarithm of the tail probability of a chi-square, also for small probabilities.
 
-    Below the range of floating-point numbers, the leading term of the asymptotic series is used (Abramowitz, Stegun
-    1964, eq. 6.5.32). With `dof` of zero, the result is 0, a probability of one.
+    `statistic` is the chi-square, and `dof` its degrees of freedom. Below the range of floating-point numbers, the
+    leading term of the asymptotic series is used (Abramowitz, Stegun 1964, eq. 6.5.32). With `dof` of zero, the result
+    is 0, a probability of one.
     """
     from scipy.special import gammaincc, gammaln
 
@@ -252,7 +258,10 @@ def significance(at: Influence, groups: Sequence[Group]) -> Array:
 
 
 def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the first-order decrease of the cost without each of G sets of rows, and its degrees of freedom, (G,)."""
+    """Return the first-order decrease of the cost without each of G sets of rows, and its degrees of freedom, (G,).
+
+    `at` is the influence of all rows, and `rows` are the row numbers of each set.
+    """
     drop, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
     # handle sets of one size together: thousands of small eigenvalue problems are one batch
     sizes = np.array([len(own) for own in rows])
@@ -266,7 +275,10 @@ def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
-    """Return the estimated error of each of some groups, if all of them have errors at once."""
+    """Return the estimated error of each of some groups, if all of them have errors at once.
+
+    A component that the other rows do not determine has an infinite sigma.
+    """
     rows = [at.rows(group) for group in groups]
     index = np.concatenate(rows)
     block, root = at.block(index), at.root(index)
@@ -347,11 +359,13 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
         work = work.with_rows(weight=np.where(_rows_of_suspect(work, origin, one), 0.0, work.weight))
     at = influence(work, embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
+    # c'Q c of each channel, for an error of one unit in all its rows
     seen = np.array([at.block(rows).sum() for _, rows in channels])
     determined = np.array(
         [at.block(rows).sum() > _ROUNDING * at.precision[rows][:, rows].sum() for _, rows in channels]
     )
     least = np.where(determined, NOTICEABLE / np.sqrt(np.where(determined, seen, 1.0)), np.inf)
+    # shift of the shared unknowns by such an error
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
@@ -363,7 +377,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
 def _rows_of_suspect(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
     """Return a mask (m,) of the rows of a suspect; the problem may have arrival times instead of differences.
 
-    `origin` has the numbers of the original rows from which each row comes.
+    `origin` has the numbers of the original rows from which each row comes. `work` is the problem with m rows.
     """
     if suspect.group == "station":
         a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")
@@ -389,7 +403,10 @@ def embed(layout: Layout, other: Layout, x: Array) -> Array:
 
 
 def _channels(problem: Problem) -> list[tuple[str, Array]]:
-    """Return the name and the row numbers of each station and kind with present rows that have a station."""
+    """Return the name and the row numbers of each channel, a station together with a kind of rows.
+
+    Rows without a station and rows with weight zero belong to no channel. A difference belongs to its first station.
+    """
     present, out = problem.weight.reshape(-1)[: problem.count] > 0.0, []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         inside = present[start : start + rows.count] & (rows.a >= 0)

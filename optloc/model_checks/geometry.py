@@ -33,7 +33,7 @@ class Advice:
         The remedy, a sentence without its full stop.
     toml : str
         Lines of a problem file for the remedy. Put them at the end of the file; put keys into `[[measurements]]`. Empty
-        if there is no such line.
+        if the remedy needs no lines.
     """
 
     cause: str
@@ -141,10 +141,14 @@ def _noise(problem: Problem) -> float:
 
 
 def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
-    """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits."""
+    """Yield advice if the stations are in a plane or on a line, or if the mirror image of a fix fits.
+
+    `x` (1, size) is the fix; NaN if there is no fix.
+    """
     shape = _shape(problem)
     if shape is None or shape.extent[-1] == 0.0:
         return
+    # whether the stations have no extent along each principal axis, in ascending order of the extent
     d, flat = problem.dimension, np.array([_is_flat(problem, shape, i) for i in range(problem.dimension)])
     if flat[0] and not (d == 3 and flat[1]) and _equality_excludes_image(problem, shape):
         return
@@ -178,6 +182,7 @@ def _equality_excludes_image(problem: Problem, shape: _Shape) -> bool:
             continue
         if band.kind == "plane":
             c = band.coefficients.reshape(-1, band.coefficients.shape[-1])[0]
+            # distance of the centre of the stations from the plane, times the length of c
             off = np.abs(band.lower - c @ shape.centre[: len(c)]).min()
             if abs(float(c @ normal[: len(c)])) > _ACROSS * float(np.linalg.norm(c)) and off > 0.0:
                 return True
@@ -189,7 +194,8 @@ def _equality_excludes_image(problem: Problem, shape: _Shape) -> bool:
 def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
     """Return whether the data separate no position from its mirror image across an axis by three sigma.
 
-    `axis` is the number of a principal axis of the stations.
+    `axis` is the number of a principal axis of the stations: 0 is the normal of their best-fitting plane. The result is
+    also True if the extent of the stations along the axis is negligible.
     """
     height = (shape.places - shape.centre) @ shape.axes[:, axis]
     # a mirror image changes a range by at most twice the height of the station
@@ -207,7 +213,8 @@ def _describe_offset(shape: _Shape) -> str:
 def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     """Return whether the mirror image of a fix `x` (1, size) leads to a second minimum that fits almost as well.
 
-    Its cost is higher by less than nine. It must be on the other side of the plane and satisfy the constraints.
+    The cost of the second minimum exceeds the cost of the fix by less than nine. The minimum must be on the other side
+    of the plane and satisfy the constraints.
     """
     if not one_place(problem) or not np.isfinite(x).all():
         return False

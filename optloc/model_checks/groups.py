@@ -91,6 +91,7 @@ class _Columns:
         # place: the number of a row among rows with equal columns, so that their names differ
         label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
+        # position in the sorted order minus the position of the first equal row
         place[order] = np.arange(len(a)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         return cls(kind, a, b, epoch, target, place, sizes[label])
 
@@ -99,8 +100,9 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
     """Return the groups that can be wrong together, each set of rows once: stations first, then rows, then priors.
 
     The rows of one target at one epoch by the same stations also form a group, for instance an azimuth and an
-    elevation. A station with all rows forms no group: without it no row would remain. `present` (m,) marks the rows
-    that are present, and `by` lists the kinds of groups.
+    elevation. Common offsets come last. A prior forms a group only if it is on an unknown that all epochs share. A
+    station with all rows forms no group: without it no row would remain. `present` (m,) marks the rows that are
+    present, and `by` lists the kinds of groups.
     """
     columns, found = _Columns.of(problem), dict[tuple[int, ...], Group]()
     if "station" in by:
@@ -122,7 +124,10 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
 
 
 def _offsets(problem: Problem, present: Array) -> Iterator[Group]:
-    """Yield a common offset for each kind of length without an emission time and without a bias."""
+    """Yield a common offset for each kind of length without an emission time and without a bias.
+
+    `present` (m,) marks the present rows; a kind needs more than one of them.
+    """
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         own, model = slice(start, start + rows.count), MODELS[rows.kind]
         # differences have no common offset, and rows with a bias already have an offset
@@ -183,7 +188,7 @@ def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
 def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
     """Return the description of the rows with the numbers `rows`: kinds, stations, target and epoch.
 
-    All rows are of the same stations.
+    All rows are of the same stations. `columns` are the columns of all rows of the problem.
     """
     first, names = rows[0], problem.stations.names
     kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))

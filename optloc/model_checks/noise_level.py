@@ -157,7 +157,8 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
         return unchanged
     stated = _lowest_deviance(cost, dof, 1.0)
     common = np.array([_lowest_deviance(cost, dof, f).sum() for f in _FACTORS])
-    # Instead of the factor of one group, every fix may also exclude measurements.
+    # Instead of the factor of one group, every fix may also exclude measurements. With a single kind, the factor of the
+    # kind is the common factor.
     single = [*_single_groups(by_station, tests, cost, dof)]
     single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
@@ -180,6 +181,7 @@ def _with_factors(unchanged: CommonLevel, packed: Elements) -> CommonLevel:
     """
     none = np.zeros(len(packed.names), dtype=bool)
     found = fit(packed, none, none)
+    # a kind without a group gets NaN, which is not significant
     place = [packed.names.index(kind) if kind in packed.names else -1 for kind in unchanged.kinds]
     factor, low, high = (np.append(np.sqrt(v), np.nan)[place] for v in (found.variance, found.low, found.high))
     with np.errstate(invalid="ignore"):
@@ -187,6 +189,7 @@ def _with_factors(unchanged: CommonLevel, packed: Elements) -> CommonLevel:
     if not significant.any():
         return unchanged
     factor, low, high = (np.where(significant, v, 1.0) for v in (factor, low, high))
+    # the factor of each group; the last entry, 1, is for errors without a group
     factor_of_group = np.append(factor, 1.0)[
         [unchanged.kinds.index(n) if n in unchanged.kinds else -1 for n in (*packed.names, "")]
     ]
@@ -227,8 +230,8 @@ def priced_cost(tests: Tested) -> Array:
 def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
     """Return the minimum (N,) of twice the negative log-likelihood of each fix, over the number of excluded errors.
 
-    `cost` and `dof` (N, 1 + k) come from `_exclusion_path`. Sigma is multiplied by `factor`; the penalties are
-    included.
+    `cost` and `dof` (N, 1 + k) come from `_exclusion_path`: column j is the fix without j errors. Sigma is multiplied
+    by `factor`; the penalties are included.
     """
     left = np.arange(cost.shape[1])
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
@@ -237,12 +240,16 @@ def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
 def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
-    The likelihood is twice the negative logarithm. `tests` are the tests with the noise as stated, and `cost`
-    (N, 1 + k) comes from `_exclusion_path`. A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l
-    be the eigenvalues of T of `Tested` for these columns, and y the components of t along its eigenvectors. The cost
-    decreases by the sum of (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is multiplied by 1 + (f^2 - 1) l
-    for each l (A. J. Woodbury 1950). Instead of the factor, a fix may also exclude measurements.
+    The likelihood is given as twice its negative logarithm. `packed` are the linearised fixes, and `tests` the tests
+    with the noise as stated. `cost` and `dof` (N, 1 + k) come from `_exclusion_path`; `dof` is not used. Instead of
+    the factor, a fix may also exclude measurements.
+
+    A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l be the eigenvalues of T of `Tested` for
+    these columns, and y the components of t along its eigenvectors. The cost decreases by the sum of
+    (f^2 - 1) y^2 / (1 + (f^2 - 1) l), and the determinant of V is multiplied by 1 + (f^2 - 1) l for each l
+    (A. J. Woodbury 1950).
     """
+    # the lowest cost with excluded measurements; infinite if no measurement has a large test
     penalty = ROW_PRICE * np.arange(1, cost.shape[1])
     instead = (cost[:, 1:] + penalty).min(1, initial=np.inf)
     for g in np.flatnonzero(total(packed.of_effect, len(packed.names))):
@@ -256,6 +263,7 @@ def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> 
         vector = np.where(here, np.take_along_axis(tests.vector, order, 1), 0.0)
         squared = np.where(seen, (np.swapaxes(vectors, 1, 2) @ vector[..., None])[..., 0] ** 2, 0.0)
         values = np.where(seen, values, 0.0)
+        # only factors above 1 are tried: f^2 - 1 for each
         increase = _FACTORS[_FACTORS > 1.0, None, None] ** 2 - 1.0
         grown = 1.0 + increase * values
         determinant = np.log(grown).sum(-1)
@@ -285,8 +293,8 @@ class LateSignals:
     carried : bool array (N,)
         True for a fix that depends on late rows: without them it has no redundancy.
     alike : str
-        Kind whose rows are all late by the same amount; these rows do not count as late. Empty if there is no such
-        kind.
+        Kind whose rows are all late by the same amount; these rows do not count as late. Empty if no kind
+        has this error.
     offset, offset_error : float
         The common delay and its standard deviation, SI units.
     left : float
@@ -341,6 +349,7 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
     part = problem.take(kept)
     found = _late_rows(elements(part, x, "kind"), able)
     if found.share:
+        # a common offset of all rows of one kind may explain the misfit better than single late rows
         kind, offset, error, left = min((_common_delay(part, x, one) for one in able), key=lambda one: one[3])
         if offset > 0.0 and left < found.left:
             found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
@@ -372,6 +381,7 @@ def _late_kinds(problem: Problem) -> list[str]:
 def _late_rows(packed: Elements, able: list[str]) -> LateSignals:
     """Return the late rows of linearised fixes with the noise as stated; `able` are the kinds that can be late."""
     tests = tested(packed, np.ones(()))
+    # errors without a group have the number -1, which selects the empty name
     fit_for = np.isin(np.array([*packed.names, ""], dtype=object)[packed.of_effect], able)
     share, delay, gain, late, seen = _select_late(tests, fit_for)
     none = np.zeros(len(late), dtype=int)
@@ -395,7 +405,8 @@ def _common_delay(problem: Problem, x: Array, kind: str) -> tuple[str, float, fl
 
     Gauss-Newton estimates the offset over all fixes together and refines each fix after each step, because a large
     delay moves the fixes far. Offset and standard deviation are in SI units; the cost includes the penalty of the
-    offset.
+    offset. If another unknown absorbs the offset, the offset is 0, and its standard deviation and cost are infinite.
+    `problem` is a flat batch of n problems, and `x` (n, size) are their fixes.
     """
     of_kind = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
     offset, error = 0.0, np.inf
@@ -420,7 +431,8 @@ def _select_late(tests: Tested, able: Array) -> tuple[float, float, float, Array
     """Return share, mean delay in sigmas, gain, late rows (N, q) and the number of rows that other rows check.
 
     The share and the delay are estimated from rows of unknown state; then each row gets the more probable state. Both
-    steps repeat until no state changes. `able` (N, q) marks errors of kinds whose rows can be late.
+    steps repeat until no state changes. `able` (N, q) marks errors of kinds whose rows can be late. The gain is twice
+    the gain of the log-likelihood over the model without late rows.
     """
     found = snooped(tests, slice(0, tests.errors), _FIRST_CUT)
     late = found.gross & able & (found.shift > 0.0)
@@ -444,10 +456,11 @@ def _leave_one_out(tests: Tested, late: Array) -> tuple[Array, Array]:
     """Return the estimated error (N, q) of each row and its standard deviation, from the other rows that are not late.
 
     `late` (N, q) marks late rows. Both results are in sigmas of the row; NaN if the other rows do not determine the
-    error.
+    error. For a late row, all other late rows are excluded as well.
     """
     items, q = np.arange(len(late)), tests.errors
     shift, sigma = error_sizes(without(tests, late), slice(0, q))
+    # one iteration for the first late row of each fix, one for the second, and so on
     order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
     for column in order.T:
         own = late[items, column]
@@ -465,9 +478,11 @@ def _fit_mixture(error: Array, sigma: Array, late: Array) -> tuple[float, float,
 
     `error` and `sigma` (r,) are from `_leave_one_out`, and `late` (r,) is the first selection. The errors are normal. A
     late row has an additional exponentially distributed delay. If the mean delay is negligible, all results are zero.
+    The gain is as in `_select_late`.
     """
     from scipy.special import erfcx, log_ndtr
 
+    # EM cannot leave a share of zero or one, so the first share is between them
     share = float(np.clip(late.mean(), 0.5 / max(len(late), 1), 0.9)) if len(late) else 0.0
     delay = float(np.mean(error[late])) if late.any() else 0.0
     if not share or delay <= 0.0:

@@ -55,14 +55,15 @@ def tail_factors(packed: Elements, found: VarianceFit) -> Array:
 def _needed_factor(tests: Tested, own: Array, variance: float) -> float:
     """Return the smallest factor of a variance with which normal tails bound the tails of some errors.
 
-    `own` (N, q) marks the errors, and `variance` is their present variance. The largest factor that is tried is
-    returned if none is sufficient.
+    `own` (N, q) marks the errors, and `variance` is their present variance. If no tried factor is sufficient, the
+    result is the largest of them. The result is 1 if no error affects the residuals enough for a test.
     """
     size = tests.size[:, : tests.errors]
     own = own & (size * variance > _SHOWN)
     count = int(own.sum())
     if not count:
         return 1.0
+    # theta T of each error, and its squared test
     share, squared = size[own] * variance, tests.vector[:, : tests.errors][own] ** 2 / size[own]
     expected = count * _tail_probabilities()
     allowed = expected + _CHANCE * np.sqrt(expected) + 1.0

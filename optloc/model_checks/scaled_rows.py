@@ -69,7 +69,8 @@ def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple
     """Return the lowest cost over all unknowns except the position, with the information and gradient of the position.
 
     Arguments and results are as in `optloc.model_checks.shape.profile`. The derivative of a row by the position depends
-    on the scales, so more passes make it exact. Factors of ranges, times and levels are not negative.
+    on the scales, so more passes make it exact. Factors of ranges, times and levels are not negative: their scales are
+    at least `_STILL`.
     """
     slot, _ = problem.layout.find("position")
     part, (scale, least) = np.arange(slot.start, slot.start + slot.size), _scales(problem)
@@ -83,9 +84,11 @@ def profile_by_rows(problem: Problem, x: Array, at: Array, passes: int) -> tuple
             _project_out(basis, design[..., part]),
             design[..., scale],
         )
+        # a scale whose column the other unknowns explain completely is fixed: the remaining column is rounding
         column = _project_out(basis, along)
         usable = np.sqrt((column**2).sum(-2)) > _EXPLAINED * np.sqrt((along**2).sum(-2))
         move, left, at_bound = _bounded(column * usable[..., None, :], left, least - x[..., scale])
+        # a scale at its bound does not react to the position, so its column is not projected out of the slope
         free_basis = span_of(column * (usable & ~at_bound)[..., None, :])
         slope = _project_out(free_basis, slope)
         x = np.array(x)
@@ -105,6 +108,7 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
     out, free = np.full(len(x), np.inf), _without_prior(problem)
     if problem.constraints or not len(free):
         return out
+    # `items` are the problems with coplanar stations; only their waves are paraboloids
     centre, normal, tangents, spread, items = _planes_of(problem, len(x))
     if not len(items):
         return out
@@ -124,11 +128,12 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
 def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
     """Return the lowest cost (N,) of distant waves with one free factor; a position is a tilt of the wave front.
 
-    `there` (N, size) are vectors with distant positions. `at` (N, size) are the fixes, at which station errors are
-    weighted. `part` (d,) are the columns of the position, `tangents` (N, d, d - 1) span the plane of the stations, and
-    `j` is the column of the factor.
+    `there` (N, size) are vectors with distant positions. `at` (N, size) are the fixes, at which the noise of station
+    errors is computed. `part` (d,) are the columns of the position, and `j` is the column of the factor. `tangents`
+    (N, d, d - 1) span the plane of the stations.
     """
     residual, design = _rows(problem, there, at)
+    # the factor multiplies only these rows; only they receive a tilt
     touched = (design[..., j] != 0.0)[..., None]
     tilt = np.where(touched, design[..., part] @ tangents, 0.0)
     rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))
@@ -142,7 +147,7 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
     """Return the lowest cost (N,) of distant waves with several free factors, which all come from one position.
 
     The method is Gauss-Newton along the tangents (N, d, d - 1), whose length is one spread. A step is at most one
-    spread. The other arguments are as in `_above_any_place`.
+    spread. The other arguments are as in `_above_any_place`. The centre of the starts is `there` (N, size).
     """
     count, along = tangents.shape[-1], np.swapaxes(tangents, -1, -2)
     first = np.stack(np.meshgrid(*[_OFFSETS] * count), axis=-1).reshape(-1, 1, count)
@@ -159,7 +164,7 @@ def _above_one_place(problem: Problem, there: Array, at: Array, part: Array, tan
 
 
 def _without_prior(problem: Problem) -> Array:
-    """Return the columns of the unknown scales of ranges that have no prior."""
+    """Return the columns of the unknown scales that multiply ranges and have no prior."""
     scale, least = _scales(problem)
     levels = scale[~_multiplies_kind(problem, lambda model: model.ranges is not None)]
     known = [columns(problem.layout, name, np.array([0]))[0] for name, _, _ in prior_parts(problem)]
@@ -169,8 +174,8 @@ def _without_prior(problem: Problem) -> Array:
 def _planes_of(problem: Problem, count: int) -> tuple[Array, Array, Array, Array, Array]:
     """Return the planes of the stations, for the problems whose stations are coplanar.
 
-    The results are centre (n, d) in m, unit normal (n, d), unit tangents (n, d, d - 1), spread (n,) in m, and the
-    numbers (n,) of these problems. `count` is the number of all problems.
+    The first two results are the centres (n, d), m, and the unit normals (n, d). They are followed by the unit tangents
+    (n, d, d - 1), the spreads (n,), m, and the numbers (n,) of these problems. `count` is the number of all problems.
     """
     places = problem.stations.places
     places = np.broadcast_to(places, (count, *places.shape[-2:]))
@@ -196,7 +201,7 @@ def _multiplying(problem: Problem) -> list[Bias]:
 
 
 def _is_level(model: Model) -> bool:
-    """Return whether a kind is a received power, which decreases with the distance."""
+    """Return whether a kind is a received power (a level), which depends on the logarithm of the range alone."""
     return {node for _, node in model.nodes} == {"log range"}
 
 
@@ -210,7 +215,9 @@ def _multiplies_kind(problem: Problem, of_kind: Callable[[Model], bool]) -> Arra
 def _rows(problem: Problem, x: Array, at: Array) -> tuple[Array, Array]:
     """Return whitened residuals (..., r) and derivatives (..., r, size) of all rows and priors at vectors (..., size).
 
-    Station errors are weighted at the vectors `at`.
+    The noise of the rows includes station errors of span "noise", which are new at each epoch. Their effect is computed
+    at the vectors `at`. Column j of the derivatives belongs to unknown j of the vectors. `x` (..., size) are the
+    vectors.
     """
     layout, (residual, folded) = problem.layout, differentiate(problem, x)
     n, length, total = layout.n_shared, layout.n_local, layout.size

@@ -1,7 +1,8 @@
 """Score tests for systematic errors of one channel, and refits that confirm them.
 
-A score test needs no fit of the larger model, so it can rank many possible errors. The best candidates are then fitted.
-A candidate is an error that the problem does not model, and q is the number of its unknowns.
+A channel is a station together with a kind of rows. A score test needs no fit of the larger model, so it can rank many
+possible errors. The best candidates are then fitted. A candidate is an error that the problem does not model, and q is
+the number of its unknowns.
 """
 
 from __future__ import annotations
@@ -132,18 +133,20 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
     channels = sum(one.is_channel_offset for one in found)
     more = channels * problem.epochs * (2 * _search_width(problem) + 2) if any(o.form == "step" for o in found) else 0
     level = 1.0 - FALSE_ALARM / (len(found) + more)
-    # a statistic is the square of a projection of the residual, so it is at most the cost
+    # a statistic is the square of a projection of the residual, so it is at most the cost: no test can be significant
     if cost[0] <= quantile(level, 1):
         return ()
     scores = score(problem, x, found)
     sharp = tuple(_sharpened(problem, x, found, np.array([one for one, _, _ in scores])))
     if sharp:
         found, scores = (*found, *sharp), [*scores, *score(problem, x, sharp)]
+    # a rotation in space has three unknowns, so its limit is higher: the excess over the limit ranks the candidates
     limit = np.array([quantile(level, max(1, size)) for _, _, size in scores])
     values = np.array([one for one, _, _ in scores])
     order = np.argsort(-np.where(values > limit, values - limit, -np.inf), kind="stable")[:_FITTED]
     explained = []
     for i in order:
+        # the remaining redundancy must allow a chi-square test
         if values[i] <= limit[i] or dof - scores[i][2] < 1:
             continue
         fitted = _fitted(problem, x, found[i], scores[i])
@@ -156,7 +159,8 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
 def _distinct(explained: list[Explained]) -> tuple[Explained, ...]:
     """Return the explanations whose cost is almost the lowest, in ascending order of the cost.
 
-    Of explanations of the same station that fit equally well, only the simplest is returned.
+    Of explanations of the same station that fit equally well, only the simplest is returned. `explained` are the
+    explanations that pass all tests, in any order.
     """
     # for one row, an offset, a scale and a drift are equal, and also for rows of one position
     simple = sorted(explained, key=lambda one: (_is_time_scale(one), _ORDER.index(one.candidate.form), one.cost))
@@ -195,7 +199,11 @@ def _is_of_arrivals(kind: str) -> bool:
 
 
 def candidates(problem: Problem) -> tuple[Candidate, ...]:
-    """Return the systematic errors that the rows of a problem could have and that the problem does not model."""
+    """Return the systematic errors that the rows of a problem could have and that the problem does not model.
+
+    They are errors of all rows of a kind and errors of single stations. Kinds and stations without present rows have no
+    candidates.
+    """
     names = problem.stations.names
     present = np.broadcast_to(problem.weight, (1, problem.count))[0] > 0.0
     out: list[Candidate] = []
@@ -204,6 +212,7 @@ def candidates(problem: Problem) -> tuple[Candidate, ...]:
         if not inside.any():
             continue
         end_count = MODELS[rows.kind].stations
+        # the stations of the present rows; -1 means no station
         observing = np.unique(
             np.concatenate([index[inside] for index in (rows.a, rows.b)[:end_count]] or [np.zeros(0, int)])
         )
@@ -282,7 +291,8 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
     """Return the best step and the best burst with their ends moved to the epochs with the highest test.
 
     An error of many sigma between two tried times leaves a misfit, which would hide the kind of the error. `values` are
-    the test statistics of the candidates `found`.
+    the test statistics of the candidates `found`, and `x` (1, size) is the fix. The first epoch is moved first,
+    then for a burst the epoch after its last epoch.
     """
     out, around = [], _search_width(problem)
     for form in ("step", "burst"):
@@ -298,6 +308,7 @@ def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: A
         )
         for end in range(1 if form == "step" else 2):
             ends = _epochs_of(problem, best)
+            # end 0 is the first epoch, and end 1 the epoch after the last epoch; end 1 stays above end 0
             near = np.clip(ends[end] + np.arange(-around, around + 1), 1 if end == 0 else ends[0] + 1, problem.epochs)
             spans = [(k, ends[1]) if end == 0 else (ends[0], k) for k in np.unique(near).tolist()]
             tried = tuple(made for span in spans if span[0] < span[1] for made in _in_epochs(problem, whole, *span))
@@ -318,7 +329,7 @@ def _epochs_of(problem: Problem, one: Candidate) -> tuple[int, int]:
 
 
 def _restricted(bias: Bias, inside: Array) -> Bias:
-    """Return a bias that affects only those of its rows that the mask `inside` marks."""
+    """Return a bias that affects only the rows that `inside` marks; this mask has one entry per row of the bias."""
     return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 
@@ -326,7 +337,7 @@ def _restricted(bias: Bias, inside: Array) -> Bias:
 
 
 def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tuple[float, Array, int]]:
-    """Return Rao's statistic, the estimate (q,) after one step, and the number q, for every candidate.
+    """Return Rao's statistic, the estimate (q,) after one step, and the number q, for every candidate in `found`.
 
     Let r be the whitened residual, J the columns of the unknowns and c the columns of the candidate. With u = c - J J^+
     c the statistic is ``(u'r)' (u'u)^-1 (u'r)``: the part that the other unknowns can absorb is projected out. If the
@@ -336,6 +347,7 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
     larger, places = _with_families(problem, found)
     layout = larger.layout
     information, vector = _shared_equations(larger, _embed(problem, larger, x))
+    # the unknowns of each candidate; `rest` are all other shared unknowns
     parts = [slice(*(layout.find(name)[0].start + end for end in ends)) for name, ends in places]
     inside = np.concatenate([np.arange(part.start, part.stop) for part in parts])
     rest = np.setdiff1d(np.arange(layout.n_shared), inside)
@@ -349,6 +361,7 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
     root = space @ linalg.root(space.T @ information @ space)[0]
     out = []
     for part in parts:
+        # `left` is u'u and `pull` is u'r
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
@@ -372,13 +385,14 @@ def _shared_equations(problem: Problem, x: Array) -> tuple[Array, Array]:
 def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Problem, list[tuple[str, tuple[int, int]]]]:
     """Return the problem with one additional bias per form, and the place of each candidate in these biases.
 
-    A place is the name of the bias, and the first entry and the entry after the last one. All candidates of a form are
-    members of one bias: a bias with many members takes no more time than a bias with one.
+    A place is the name of the bias, its first entry and the entry after its last entry. All candidates of a form are
+    members of one bias: a bias with many members takes no more time than a bias with one. `found` are the candidates.
     """
     more, places = [], [("", (0, 0))] * len(found)
     for form in dict.fromkeys(one.bias.form for one in found):
         numbers = [i for i, one in enumerate(found) if one.bias.form == form]
         parts = [found[i].bias for i in numbers]
+        # `size` is the number of unknowns of each member
         name, size = f"{form} that is tested", prod(FORMS[form].shape(parts[0], problem.dimension)[1:])
         member = np.concatenate([np.full(len(part.row), j) for j, part in enumerate(parts)])
         row, coefficient = (np.concatenate([getattr(part, key) for part in parts]) for key in ("row", "coefficient"))
@@ -471,7 +485,8 @@ class ScoreFit:
 def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
     """Return the best fit of N problems of one position, by descents from starts in all directions around the stations.
 
-    The result is not proven. If the search misses the best position, an advice is missing, but no advice is wrong.
+    The result is not proven to be the best fit. The cost is infinite if every descent failed or ended beyond `_FLAT`
+    spreads of the stations. If the search misses the best position, an advice is missing, but no advice is wrong.
     `more` (N, size) is one additional start of each problem; NaN for none.
     """
     n, layout = problem.batch_shape[0], problem.layout
@@ -485,6 +500,7 @@ def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
     x[..., slot.start : slot.start + slot.size] = points
     if more is not None:
         x = np.concatenate([x, np.where(np.isfinite(more), more, x[:, 0])[:, None]], axis=1)
+    # all descents of all problems form one batch
     many = problem.take(np.repeat(np.arange(n), x.shape[1]))
     found, cost = (part.reshape(*x.shape[:2], -1) for part in descend(many, x.reshape(-1, layout.size)))
     away = found[..., slot.start : slot.start + slot.size] - centre[..., None, :]

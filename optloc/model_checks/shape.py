@@ -28,9 +28,9 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     """Return the lowest cost over all unknowns except the position, with the information and gradient of the position.
 
     `problem` is a flat batch of N problems with one position. `x` (q, N, size) holds positions and starts of the other
-    unknowns. Station errors of span "noise" are weighted at `at` (N, size). `passes` is the number of updates of the
-    other unknowns. One update is exact if the rows are linear in them, unless the start is so far off that rounding
-    matters.
+    unknowns. Station errors that are new at each epoch (span "noise") add to the noise of the rows. Their effect is
+    computed at the vectors `at` (N, size). `passes` is the number of updates of the other unknowns. One update is exact
+    if the rows are linear in them, unless the start is so far off that rounding matters.
 
     The results are costs (q, N), information (q, N, d, d) and vectors (q, N, d). The information belongs to the
     position, with other unknowns eliminated. The vector is half the negative gradient of the cost.
@@ -60,15 +60,16 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
 
 
 def _other_directions(problem: Problem, x: Array, part: slice) -> Array:
-    """Return the directions (..., n, p) of the shared unknowns except the position, along the equalities about them.
+    """Return p directions (..., n, p) of the n shared unknowns that keep the position and satisfy the equalities.
 
-    `x` (q, N, size) are vectors and `part` is the slice of the position. A height that is kept along a course is an
-    equality about the velocity as well.
+    `x` (q, N, size) are vectors and `part` is the slice of the position. An equality can restrict other unknowns too.
+    For instance, a fixed height of a moving target restricts its velocity.
     """
     n, face = problem.layout.n_shared, exact(problem)
     free = np.eye(n)[:, np.r_[0 : part.start, part.stop : n]]
     if not face or not free.shape[1]:
         return free
+    # the derivatives of the equalities by the free unknowns; directions with zero derivatives remain
     gradients = np.stack([levels(problem, face, one)[1] for one in x]) @ free
     if not gradients.any():
         return free
@@ -105,10 +106,11 @@ _PART = 2**16
 def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre: Array) -> Array:
     """Return the departure (N, 2) of the cost from a Gaussian at three sigma, in metres and in inverse range.
 
-    It is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|`` over the principal axes t, in both directions: zero for a
-    Gaussian, infinite if there is no chart. The second chart is tested only if the departure in the first chart exceeds
-    a tenth. `x` (N, size) are the fixes, and `covariance` (N, n, n) the covariances of their shared unknowns. `face`
-    holds the equality constraints. `centre` (N, d) is the origin of the inverse-range chart.
+    It is the largest ``|ln((f(x +- 3 t) - f(x)) / 9)|`` over the principal axes t, in both directions. It is zero for a
+    Gaussian, and infinite for a chart that is not tested. The second chart is tested only if the departure in the first
+    chart exceeds a tenth, and only without equalities. `x` (N, size) are the fixes, and `covariance` (N, n, n) the
+    covariances of their shared unknowns. `face` holds the equality constraints. `centre` (N, d) is the origin of the
+    inverse-range chart.
 
     References
     ----------
@@ -188,7 +190,8 @@ class ShapeTest:
 def _axes(covariance: Array) -> Array:
     """Return displacements (N, k, d) of one standard deviation along all principal axes of covariances (N, d, d).
 
-    For equal variances, axes rotated by 45 degrees are added.
+    For equal variances, axes rotated by 45 degrees are added. `covariance` belongs to the positions, m^2; a covariance
+    that is not finite counts as zero.
     """
     known = np.isfinite(covariance).all((-1, -2), keepdims=True)
     values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0))
@@ -212,7 +215,8 @@ _EXACT = 1e-14
 def _in_inverse_range(test: ShapeTest, centre: Array, covariance: Array) -> Array:
     """Return the largest departure (N,) along the principal axes of the inverse-range chart.
 
-    `centre` (N, d) is the origin of the chart, and `covariance` (N, d, d) belongs to the positions, m^2.
+    `centre` (N, d) is the origin of the chart, and `covariance` (N, d, d) belongs to the positions, m^2. `test` holds
+    the fixes and their problems.
     """
     position = test.x[:, test.part]
     chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)
@@ -223,6 +227,7 @@ def _in_inverse_range(test: ShapeTest, centre: Array, covariance: Array) -> Arra
     share = np.where(y[..., -1] < 0.0, np.minimum(1.0, (1.0 - _NEAR_INFINITY) / np.maximum(-y[..., -1], 1e-300)), 1.0)
     y, sigmas = y * share[..., None], sigmas * share
     still = (y == 0.0).all(-1)
+    # the fix has the chart coordinates (0, ..., 0, 1)
     y[..., -1] += 1.0
     # points (k, N, d) broadcast against the charts of N fixes
     there = np.moveaxis(chart.to_position(np.moveaxis(y, 1, 0)), 0, 1)
@@ -249,10 +254,11 @@ _BROKEN = 1e-4
 
 
 def cost_at_infinity(problem: Problem, x: Array) -> Array:
-    """Return the lowest cost (N,) of positions at infinity; large if the cost is unbounded there.
+    """Return the lowest cost (N,) of positions at infinity, computed at `_INFINITE` spreads of the stations.
 
-    `problem` is a flat batch of N problems with one position. The fixes `x` (N, size) give the first direction and the
-    start of the other unknowns.
+    The cost is large if it has no limit there, and infinite if a constraint excludes all directions. `problem` is a
+    flat batch of N problems with one position. The fixes `x` (N, size) give the first direction and the start of the
+    other unknowns.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -273,7 +279,7 @@ def cost_at_infinity(problem: Problem, x: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Sphere:
-    """Positions on a sphere about the stations, so large that only their directions matter.
+    """Positions on a sphere about the stations. It is so large that the cost depends on the directions alone.
 
     - problem: flat batch of N problems with one position.
     - x (N, size): start of the other unknowns.
@@ -312,6 +318,7 @@ class _Sphere:
 
     def descend(self, direction: Array) -> Array:
         """Return the lowest costs (q, N) near directions (q, N, d), by damped Gauss-Newton on the sphere."""
+        # the tangents `across` of the sphere have lengths in metres, so `move` is a rotation in radians
         cost, information, vector = self.evaluate(direction)
         damping, growth = np.full(cost.shape, _DAMPING), np.full(cost.shape, FIRST_GROWTH)
         scale = self.radius[:, None, None]

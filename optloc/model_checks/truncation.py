@@ -64,7 +64,8 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
 
     `problem` is a flat batch of N problems with one static position. `x` (N, size) are the fixes; NaN for none.
     `covariance` (N, n, n) is the covariance of the shared unknowns without the inequalities. `shift` (N, n) is the mean
-    of the distribution without inequalities minus the fix.
+    of the distribution without inequalities minus the fix. A bound that is too far away to matter gets an infinite
+    slack.
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -77,10 +78,11 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
         near = open_ones & (values <= _NEAR * sigma)
         if not near.any():
             return None
+        # if one bound is near, the farther bounds of the same fix count up to `_REACH`
         slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
         departures = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
     bent = np.isfinite(slack) & (departures > _FLAT * sigma)
-    # a curved bound that the fix does not touch is treated like a bound far away
+    # a curved bound that the fix does not touch is ignored; if the fix touches it, the result is not sound
     touched = slack <= _ON * sigma
     slack = np.where(bent & ~touched, np.inf, slack)
     along, span = _edges(problem, sides, x, part)
@@ -109,7 +111,8 @@ def _departures(
     """Return the departures (N, h) of near bounds from their tangent planes at three standard deviations, m.
 
     `spread` (N, d, d) are the covariances of the positions. `values` (N, h) and `normal` (N, h, d) are from `_planes`.
-    `near` (N, h) marks the bounds to compute; the other departures are zero.
+    `near` (N, h) marks the bounds to compute; the other departures are zero. `sides` are the h bounds, and `x` (N,
+    size) are the fixes.
     """
     departures, d = np.zeros(values.shape), spread.shape[-1]
     slot, _ = problem.layout.find("position")
@@ -137,7 +140,8 @@ def _departures(
 def _edges(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
     """Return unit vectors (N, h, d) along the edges of polygons, and their ends (N, h, 2), m from the fix.
 
-    For a bound that is no edge of a polygon, the vector is zero and the ends are infinite.
+    For a bound that is no edge of a polygon, the vector is zero and the ends are infinite. `sides` are the h bounds,
+    `x` (N, size) are the fixes, and `part` is the slice of the position.
     """
     n, d = len(x), part.stop - part.start
     along, span = np.zeros((n, len(sides), d)), np.tile([-np.inf, np.inf], (n, len(sides), 1))
@@ -178,6 +182,8 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
 
     `law` is the distribution of one position. A step stays on the other bounds that the fix touches.
     """
+    # `factor` converts independent standard normal numbers to metres. In these numbers, the distribution without bounds
+    # is round with unit variance and the mean `middle`, and the fix is at zero.
     factor = factor_of(law.covariance)
     turned = law.normal @ factor
     sigma = np.sqrt((turned**2).sum(-1))
@@ -189,12 +195,14 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     found = []
     for k in range(len(touched)):
         other_units = np.delete(unit, k, axis=0)
+        # away from bound k; the part along the normals of the other bounds is removed
         inward = -unit[k] + other_units.T @ (np.linalg.pinv(other_units.T) @ unit[k]) if len(other_units) else -unit[k]
         size = np.sqrt((inward**2).sum())
         if size > _ALONG:
             inward = inward / size
             mean_along = float(inward @ middle)
             end = float(rest.exits((factor @ inward)[None])[0])
+            # the model increases by l^2 - 2 m l after a length l, with the mean m along the direction; solve it for 9
             length = min(mean_along + np.sqrt(mean_along**2 + AWAY**2), end)
             found.append((length * (factor @ inward), max(length**2 - 2.0 * mean_along * length, 1e-300)))
     return found
@@ -209,7 +217,9 @@ def _touches_edge(law: Truncated) -> Array:
 def covariance_of(law: Truncated, covariance: Array, part: slice) -> Array:
     """Return the covariances (N, n, n) of the shared unknowns of fixes with truncated positions.
 
-    The other unknowns respond to the position as without the bounds; `part` is the slice of the position.
+    The other unknowns respond to the position as without the bounds. `law` holds the distributions of the positions,
+    `covariance` (N, n, n) the covariances without the bounds, and `part` is the slice of the position.
     """
+    # linear response of all shared unknowns to a change of the position
     pull = covariance[..., part] @ np.linalg.pinv(law.covariance, hermitian=True)
     return np.asarray(covariance + pull @ (law.moments()[1] - law.covariance) @ np.swapaxes(pull, -1, -2))

@@ -61,14 +61,16 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     """Yield advice about values that do not fit as they are read, but fit with another unit, sign or convention.
 
     `problem` is a flat batch of one problem or run with finite values in its present rows. `x` (1, size) is its fix;
-    NaN if there is no fix.
+    NaN if there is no fix. If separate epochs are tested, the fix is not used.
     """
+    # a run whose epochs share no unknowns becomes a batch of its epochs
     batch = by_epoch(problem).flat() if separable(problem) else problem
     # use the first epochs with redundancy
     items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
     wrong = list(_impossible_advice(problem))
     if len(items) and one_place(batch):
         tested = batch.take(items)
+        # the vector of a run does not have the layout of a single epoch
         start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
         refuted, p_free = _test_as_read(tested, start if start is None else start[items])
         if wrong or refuted:
@@ -84,6 +86,7 @@ def _test_as_read(problem: Problem, start: Array | None) -> tuple[bool, float]:
 
     The p-value is 1 if the values fit, and 0 if there are no constraints. `start` (N, size) is a fix or None.
     """
+    # the fix often fits, and one descent is much faster than a search for the best position
     near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
     if _p_of_cost(problem, near) >= _MISFIT:
         return False, 1.0
@@ -93,10 +96,10 @@ def _test_as_read(problem: Problem, start: Array | None) -> tuple[bool, float]:
 
 
 def _p_of_best_fit(problem: Problem, start: Array | None = None) -> float:
-    """Return the chi-square probability of the best position, without inequalities.
+    """Return the chi-square probability of the best position of a search, without inequalities.
 
-    If the values fit without constraints, the position must also satisfy the equalities. If they do not, equalities
-    could only lower the probability further. `start` (N, size) is one more start of the search.
+    If the values fit without constraints, the position must also satisfy the equalities. If the values do not fit,
+    equalities could only lower the probability further. `start` (N, size) is one more start of the search.
     """
     free = fit_anywhere(replace(problem, constraints=()), start)
     cost = float(free.cost.sum())
@@ -124,8 +127,9 @@ def _fitting_readings(problem: Problem) -> Iterator[Advice]:
     tried = list(_readings(problem))
     found = []
     for one in tried:
-        # noise that is stated in a separate unit keeps its size
+        # noise that is stated in a separate unit keeps its size; the problem does not hold this unit, so try both
         scaled, stated = _with_reading(problem, one, False), _with_reading(problem, one, True)
+        # each reading is tested twice, so the probability of a fit by chance is multiplied by two (Bonferroni)
         able = [other for other in (scaled, stated) if _chance_of_fit(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
             continue
@@ -157,7 +161,9 @@ def _readings(problem: Problem) -> Iterator[Reading]:
 def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
     """Yield readings of lengths in another unit than stated, one for each ratio of two units.
 
-    The SI unit comes first. Units of time count as lengths: they are multiplied by the speed of light.
+    `kinds` are the kinds of the rows with lengths. The SI unit comes first. Units of time count as lengths: they are
+    multiplied by the speed of light. If two pairs of units have the same ratio, the values cannot separate them, and
+    only the first pair is tried.
     """
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
@@ -195,7 +201,11 @@ def _either(pairs: list[str]) -> str:
 
 
 def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
-    """Yield readings as compass azimuths, as opposite azimuths, and as angles in the other unit."""
+    """Yield readings as compass azimuths, as opposite azimuths, and as angles in the other unit.
+
+    `kinds` are the kinds of the rows with angles. Compass azimuths are clockwise from north, other azimuths
+    counter-clockwise from east, so a compass azimuth z means pi / 2 - z.
+    """
     bearings = tuple(kind for kind in kinds if kind == "azimuth")
     turned = np.pi / 2
     if bearings:
@@ -252,10 +262,12 @@ def _station_extent(problem: Problem) -> float:
 def _chance_of_fit(problem: Problem) -> float:
     """Return the probability that random values fit: each redundant value within four sigma of its prediction.
 
-    Random lengths are anywhere within the array, random angles anywhere on the circle. The probability of one value is
-    the median over all rows.
+    A random angle is uniform between -pi and pi. A random value of any other kind is uniform between minus and plus
+    `_station_extent`. The probability of one value is 4 sigma divided by this half width, and at most 1. All redundant
+    values have the same probability, the median over all rows.
     """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count).max(0)
+    # half widths of the intervals of random values
     width = np.concatenate(
         [
             np.full(r.count, np.pi if MODELS[r.kind].quantity == "angle" else _station_extent(problem))
@@ -270,7 +282,8 @@ def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
     """Yield the rows of a kind, the number of an impossible value among them, and the distance of its stations, m.
 
     A difference is impossible if it exceeds the distance of its stations. A range or a sum of ranges is impossible
-    below this distance; a range has one station, so its limit is zero.
+    below this distance; a range has one station, so its limit is zero. Rows with an unknown emission time or a bias are
+    omitted, because this unknown can shift their values. A value counts only beyond `_IMPOSSIBLE_SIGMAS`.
     """
     sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
     observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
@@ -279,6 +292,7 @@ def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
         ranges, part = MODELS[rows.kind].ranges, slice(start, start + rows.count)
         if ranges not in ((1, -1), (1, 0), (1, 1)) or MODELS[rows.kind].emission or _is_biased(problem, part):
             continue
+        # stations at rest have positions for one epoch only, number 0
         moving = rows.epoch if position.shape[-3] > 1 else np.zeros_like(rows.epoch)
         apart = np.zeros(rows.count)
         if ranges[1]:
@@ -292,7 +306,7 @@ def _impossible_rows(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
 
 
 def _is_biased(problem: Problem, part: slice) -> bool:
-    """Return whether a bias of the problem can move the rows beyond the possible values."""
+    """Return whether a bias of the problem affects a row in the slice `part`, so that any value is possible."""
     return any(((bias.row >= part.start) & (bias.row < part.stop)).any() for bias in problem.biases)
 
 

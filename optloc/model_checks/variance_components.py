@@ -40,7 +40,7 @@ _CUT_SHARED = 10.0
 """The same limit for an error that several rows share.
 
 A fix can absorb a shared error like a change of position, so the test is not reliable. An error that is excluded from
-the level is in no covariance. One in fifteen headings of the robot data exceeds 3.5."""
+the estimate of the variance is in no covariance. One in fifteen headings of the robot data exceeds 3.5."""
 
 # Margin between the squared test of a gross row and the squared test of a shared error: a likelihood ratio of ninety.
 _MARGIN = 9.0
@@ -147,6 +147,7 @@ def fit(packed: Elements, left: Array, single: Array) -> VarianceFit:
     packed, size = without_groups(packed, left), len(packed.names)
     with_errors = np.flatnonzero(total(packed.of_effect, size))
     count, number_of_group = len(with_errors), np.full(size + 1, -1)
+    # Groups with errors get the numbers 0, 1, ...; all others get -1, also the last entry, for errors without a group.
     number_of_group[with_errors] = np.arange(count)
     group, nothing_fixed = number_of_group[packed.of_effect], np.zeros(count, dtype=bool)
     if not (tested(packed, np.ones(())).dof > 0).any():
@@ -216,6 +217,7 @@ def visible(packed: Elements, found: VarianceFit, left: Array) -> Array:
     size = len(packed.names)
     variance = np.append(np.nan_to_num(found.variance), 0.0)
     tests = without(tested(packed, variance[packed.of_effect]), found.gross)
+    # An excluded group has the factor zero. Its score is the derivative by the factor, not by the logarithm.
     scale = np.where(left, 1.0, variance[:-1])
     information, per_fix = _score(tests, packed.of_effect, scale, np.zeros(size, dtype=bool))
     rest = np.flatnonzero(~left)
@@ -230,18 +232,19 @@ def visible(packed: Elements, found: VarianceFit, left: Array) -> Array:
     return np.asarray(determined & (per_fix.sum(0) > _SIGNIFICANT * np.sqrt(np.where(determined, remaining, 1.0))))
 
 
-# A shared error of three times the sigma of the rows must have a level with at most this relative error. Range fixes
-# from one side absorb most of a shared error, so the residuals allow any level: estimates of thirty times the sigma of
-# the rows occurred.
+# If a shared error has three times the sigma of the rows, the estimate of its sigma must have at most this relative
+# error. If all stations are on one side, a range fix absorbs most of a shared error, so the residuals allow any sigma:
+# estimates of thirty times the sigma of the rows occurred.
 _TIMES, _RELATIVE = 3.0, 0.25
 
 
 def _determinable(tests: Tested, packed: Elements, found: VarianceFit, left: Array) -> Array:
-    """Return a mask (g,) of groups whose level would be determined if it were a few times the level of the rows.
+    """Return a mask (g,) of groups whose sigma would be determined if it were a few times the sigma of the rows.
 
     `found` is a fit without the groups that `left` (g,) marks, and `tests` are the tests with its variances.
     """
     level = _TIMES**2 * float(np.nanmedian(found.variance[~left]))
+    # An additional variance `level` of an error changes its T_jj to T_jj / (1 + T_jj level).
     share = tests.size[:, : tests.errors] * level
     # The standard error of a log-variance is the square root of the inverse information. It is twice the error of a
     # log-sigma.
@@ -252,8 +255,8 @@ def _determinable(tests: Tested, packed: Elements, found: VarianceFit, left: Arr
 def _maximise(packed: Elements, classes: Array, log_factor: Array, fixed: Array, penalty: Array) -> _MaximumLikelihood:
     """Return the variance factors of c classes of errors, their standard errors and the gross errors.
 
-    `classes` (N, q) is the class of each error and `log_factor` (c,) the log-factors at the start. `fixed` (c,) marks
-    factors that keep their value. `penalty` (c,) is added to the scores.
+    `classes` (N, q) is the class of each error, -1 for none, and `log_factor` (c,) the log-factors at the start.
+    `fixed` (c,) marks factors that keep their value. `penalty` (c,) is added to the scores.
     """
     count, log_factor = len(log_factor), log_factor.copy()
     # Start with medians: medians tolerate up to half of the errors as gross, but scores of the likelihood do not.
@@ -284,7 +287,8 @@ def _maximise(packed: Elements, classes: Array, log_factor: Array, fixed: Array,
 def _median_step(tests: Tested, classes: Array, variance: Array) -> Array:
     """Return steps of the log-factors (c,) that make the median of the squared tests the median of normal errors.
 
-    `classes` (N, q) is the class of each error; -1 for none. `variance` (c,) are the factors before the step.
+    `classes` (N, q) is the class of each error; -1 for none. `variance` (c,) are the factors before the step. A class
+    without testable errors has the step zero.
     """
     q = classes.shape[1]
     squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[classes]
@@ -313,7 +317,9 @@ def _score(tests: Tested, classes: Array, variance: Array, fixed: Array) -> tupl
     """Return the information (c, c) of the log-factors and the scores of each problem (N, c).
 
     With T and t of `Tested`, the score of theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g. The
-    information of theta_g and theta_h is the sum of T_ij^2 / 2 (Harville 1977, section 5).
+    information of theta_g and theta_h is the sum of T_ij^2 / 2 (Harville 1977, section 5). Multiplication by theta
+    converts both to log-factors. `variance` (c,) is theta, and `classes` (N, q) is the class of each error; -1 for
+    none. A factor that `fixed` (c,) marks has no information and no score.
     """
     (n, q), count = classes.shape, len(variance)
     # Errors without a group get an additional last class, which is dropped.
@@ -337,7 +343,7 @@ def _log_variances(tests: Tested, classes: Array, variance: Array, fixed: Array)
     """Return the variances of the log-factors, flags of determined factors, and the scoring step; all (c,).
 
     A variance is the larger one of two: the variance for normal errors, and the variance from the scatter of the
-    problems' scores.
+    problems' scores. The arguments are as in `_score`.
     """
     information, per_fix = _score(tests, classes, variance, fixed)
     inverse = _inverse(information)
@@ -351,7 +357,7 @@ def _log_variances(tests: Tested, classes: Array, variance: Array, fixed: Array)
 def _relative_errors(tests: Tested, classes: Array, variance: Array, fixed: Array) -> Array:
     """Return the relative standard errors (c,) of the square roots of the factors; infinite if not determined.
 
-    The arguments are as in `_scoring_step`.
+    The arguments are as in `_score`.
     """
     spread, determined, _ = _log_variances(tests, classes, variance, fixed)
     # Convert the error of a log-variance to the error of its square root.
@@ -359,7 +365,10 @@ def _relative_errors(tests: Tested, classes: Array, variance: Array, fixed: Arra
 
 
 def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array) -> tuple[Array, Array]:
-    """Return the lower and upper ends (c,) of the confidence intervals of the variance factors.
+    """Return the lower and upper ends (c,) of the 95 % confidence intervals of the variance factors.
+
+    Both ends are NaN if the data do not determine the factor. `found` is the fit. `classes` (N, q) is the class of each
+    error, -1 for none, and `fixed` (c,) marks factors that were not estimated.
 
     The residuals show an error plus the error of its prediction from the other rows. The variance of this sum is theta
     + tau with tau = theta (1 / r - 1) and the redundancy r of the error. Its likelihood is close to the likelihood of a
@@ -369,6 +378,7 @@ def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array
     from scipy.special import gammaincinv
 
     variance, q = found.variance, classes.shape[1]
+    # T_jj theta is the redundancy of one error. In the mean over a class, errors with more redundancy count more.
     share = found.tests.size[:, :q] * variance[classes]
     redundancy = total(classes, len(variance), share**2) / np.maximum(total(classes, len(variance), share), _MIN_MEDIAN)
     redundancy = np.clip(redundancy, _MIN_REDUNDANCY, 1.0)
@@ -376,7 +386,9 @@ def _confidence_interval(found: _MaximumLikelihood, classes: Array, fixed: Array
     spread, determined, step = _log_variances(found.tests, classes, variance, fixed)
     # The step removes the effect of the penalty: the intervals belong to the likelihood alone.
     seen = np.maximum(variance * (1.0 + step) + predicted, _MIN_REDUNDANCY * predicted)
-    half = 1.0 / np.maximum(spread * redundancy**2, _MIN_REDUNDANCY)  # half the degrees of freedom
+    # The logarithm of the sum has the variance spread r^2, because theta is the share r of the sum. With k degrees of
+    # freedom this variance is about 2 / k, so its inverse is k / 2.
+    half = 1.0 / np.maximum(spread * redundancy**2, _MIN_REDUNDANCY)
     ends = [gammaincinv(half, p) / half for p in (0.5 + 0.5 * _LEVEL, 0.5 - 0.5 * _LEVEL)]
     return tuple(np.where(determined, np.maximum(seen / end - predicted, 0.0), np.nan) for end in ends)  # type: ignore[return-value]
 
@@ -466,7 +478,7 @@ def tested(packed: Elements, variance: Array) -> Tested:
 
 
 def without(tests: Tested, gross: Array) -> Tested:
-    """Return the test statistics after all gross errors (N, q) are estimated as unknowns."""
+    """Return the test statistics after all errors that `gross` (N, q) marks are estimated as unknowns."""
     items = np.arange(len(gross))
     # One iteration per gross error of the problem with the most gross errors.
     order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
@@ -480,11 +492,12 @@ def deviance(packed: Elements, found: VarianceFit) -> float:
 
     It is the likelihood of K' v, where K is an orthonormal basis of the complement of J. The basis does not depend on
     the variances, so the values for different sets of groups are comparable (Harville 1977, section 3). A gross row is
-    an additional unknown.
+    an additional unknown. `found` holds the variances of the groups of `packed`; a NaN counts as zero.
     """
     variance = np.append(np.nan_to_num(found.variance), 0.0)[packed.of_effect]
     scaled = packed.effect * np.sqrt(variance)[:, None]
     covariance = scaled @ np.swapaxes(scaled, 1, 2) + packed.fixed
+    # Rows without any variance are padding: a unit variance does not change the determinant.
     absent = np.diagonal(covariance, axis1=1, axis2=2) == 0.0
     covariance += absent[:, :, None] * np.eye(covariance.shape[1])
     basis, sizes, _ = np.linalg.svd(packed.jacobian)
@@ -503,6 +516,7 @@ def deviance(packed: Elements, found: VarianceFit) -> float:
     order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
     for column in order.T:
         out = gross[items, column] & (tests.size[items, column] > 0.0)
+        # An additional unknown along column j multiplies the determinant by T_jj.
         doubled += float(np.log(tests.size[items, column][out]).sum()) + ROW_PRICE * int(out.sum())
         tests = tests.without(np.where(out, column, -1))
     return doubled + float(tests.cost.sum())
@@ -543,10 +557,10 @@ class Snooped:
 def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | None = None) -> Snooped:
     """Return the gross errors along some columns of the tests, by data snooping (Baarda 1968, section 4).
 
-    In each problem, the column with the largest test above its limit `cut` is excluded, and the remaining columns are
-    tested again. The procedure ends when no test exceeds its limit. `cut` is one limit for all columns or one limit per
-    column. With `shared` (N, p), the squared test of a row must also exceed a limit: the squared tests of all shared
-    columns of its problem plus a margin.
+    In each problem, the column with the largest ratio of its test to its limit `cut` is excluded, and the
+    remaining columns are tested again. The procedure ends when no test exceeds its limit. `cut` is one limit for all
+    columns or one limit per column. With `shared` (N, p), the squared test of a row must also exceed a limit: the
+    squared tests of all shared columns of its problem plus a margin.
     """
     n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
     shift, sigma = error_sizes(tests, columns)
@@ -559,6 +573,7 @@ def snooped(tests: Tested, columns: slice, cut: float | Array, shared: Array | N
             beyond = np.where(shared | (size**2 > most**2 + _MARGIN), beyond, 0.0)
         worst = beyond.argmax(1)
         hit = np.flatnonzero(beyond[np.arange(n), worst] > 1.0)
+        # A gross column keeps the estimate from before its exclusion.
         now = error_sizes(tests, columns)
         shift, sigma = (np.where(gross, old, new) for old, new in zip((shift, sigma), now, strict=True))
         if not len(hit):

@@ -59,7 +59,10 @@ def records(columns: Columns) -> list[dict[str, Any]]:
 
 
 def join_tables(parts: Sequence[Columns]) -> Columns:
-    """Return one table with the rows of all parts in order; if a part lacks a column, its rows have NaN there."""
+    """Return one table with the rows of all parts in order; if a part lacks a column, its rows have NaN there.
+
+    The columns have the order of their first occurrence.
+    """
     names = dict.fromkeys(name for part in parts for name in part)
     sizes = [len(next(iter(part.values()))) for part in parts]
     return {
@@ -80,7 +83,8 @@ def covariance_columns(covariance: Array, axes: str) -> Columns:
 def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
     """Return latitude and longitude (degrees), height (m) and the covariance along east, north, up (m^2) as columns.
 
-    If the frame is not on Earth, the result is empty. Positions are (n, d), m; covariances are (n, d, d), m^2.
+    If the frame is not on Earth, the result is empty. Positions are (n, d), m; covariances are (n, d, d), m^2. A
+    `position` that is NaN gives NaN in all columns.
     """
     if not frame.geodetic:
         return {}
@@ -172,7 +176,7 @@ def _target_rows(
     """Return the rows of one target; `names` holds the names of its position, velocity and acceleration.
 
     `target` is its number, and `labels` and `dimension` are as in `fix_columns`. The columns in `words` (n texts each)
-    are appended; every fix repeats its text in all its rows.
+    are appended; every fix repeats its text in all its rows. A target that the fix does not estimate gets NaN numbers.
     """
     estimated = names[0] in {slot.name for slot in (*fix.layout.shared, *fix.layout.local)}
     position = fix.take(names[0]) if estimated else np.full((len(fix), dimension), np.nan)
@@ -188,6 +192,7 @@ def _target_rows(
     if has_covariance:
         covariance = fix.covariance(names[0]).reshape(n * count, d, d)
         undetermined = fix.undetermined(names[0]).reshape(n * count, d)
+    # Before NaN replaces undetermined axes: east, north and up are combinations of x, y and z.
     local = geodetic_columns(fix.frame, position, covariance)
     covariance, undetermined_names = without_open(covariance, undetermined, "xyz")
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
@@ -206,6 +211,7 @@ def _target_rows(
         for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigmas, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     if "cov_ee" in local:
+        # A standard deviation above this limit means an undetermined axis; no limit without an estimate.
         limit = np.repeat(fix.widest(names[0]), count) if estimated else np.full(n * count, np.inf)
         local, undetermined_names = _hide_undetermined_levels(local, limit, undetermined_names)
     columns |= local
@@ -251,7 +257,7 @@ def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str
     """Return geodetic columns with NaN for undetermined axes (east, north, up), and the undetermined names of each row.
 
     An axis is undetermined if its standard deviation exceeds `limit` (n,), m. `before` holds the names (n texts) that
-    other columns already gave.
+    other columns already gave. `local` are the columns of `geodetic_columns`.
     """
     axes = [axis for axis in _LEVEL if f"cov_{axis}{axis}" in local]
     with np.errstate(invalid="ignore"):
@@ -269,6 +275,7 @@ def _hide_undetermined_levels(local: Columns, limit: Array, before: Sequence[str
 def level_covariance(columns: Columns, i: int) -> Array:
     """Return the covariance (d, d), m^2, of row `i` along east, north, up; without geodetic columns along x, y, z."""
     axes = "enu" if "cov_ee" in columns else "xyz"
+    # Positions in the plane have no column of the third axis; columns hold the upper triangle only.
     axes = axes[: 3 if f"cov_{2 * axes[2]}" in columns else 2]
     pairs = [[f"cov_{min(a, b, key=axes.index)}{max(a, b, key=axes.index)}" for b in axes] for a in axes]
     return np.array([[float(columns[name][i]) for name in row] for row in pairs])
@@ -330,6 +337,8 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
     seen : Observability, optional
         Observability of the biases. It gives `from_data`, the share of the information that comes from the data.
         Without `seen`, the share is NaN.
+
+    A member that the data do not determine has the sigma NaN and the additional key `undetermined`.
     """
     rows = []
     for slot in fix.layout.shared:
@@ -340,6 +349,7 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
         for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
             record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
             rows.append(record | {"unit": slot.unit, "from_data": float(share)})
+        # The last `slot.size` records belong to this bias.
         for i in np.flatnonzero(fix.undetermined(slot.name)).tolist():
             rows[len(rows) - slot.size + i]["undetermined"] = True
     return rows
@@ -389,9 +399,11 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
     if chart is None or not bool(fix.answered):
         return None
     record: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
+    # The mean and covariance in metres are in the table row; other charts need their parameters here.
     if chart.kind == INVERSE_RANGE:
         record |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
         record |= {"mean": chart.mean, "covariance": chart.spread}
+    # Bounds truncate the distribution: the mean differs from the fix, and intervals replace sigma.
     if chart.cut_off:
         record["mean"] = fix.gaussian()[0][: chart.position.shape[-1]]
         record |= {f"{axis}95": fix.interval(axis) for axis in AXES[: chart.position.shape[-1]]}

@@ -99,7 +99,10 @@ def panels(title: str, count: int, size: tuple[float, float] = SIZE) -> tuple[Fi
 
 
 def with_legend(figure: Figure) -> Figure:
-    """Return the figure after adding one legend below all panels; it lists each method once."""
+    """Return the figure after adding one legend below all panels; it lists each method once.
+
+    The figure becomes higher by the height of the legend, so that the panels keep about their size.
+    """
     shown: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()

@@ -65,7 +65,8 @@ NOT_DETERMINED = "not determined"
 def with_sigma(value: float, sigma: float, unit: str) -> str:
     """Return a number with its standard deviation, both rounded to two digits of the standard deviation.
 
-    If a constraint fixes the number, "(held)" replaces the standard deviation.
+    If a constraint fixes the number, "(held)" replaces the standard deviation. `value` and `sigma` are in the unit
+    `unit`. An infinite or NaN `sigma` is omitted.
     """
     unit = unit if unit != "1" else ""
     if sigma <= _HELD * (1.0 + abs(value)):
@@ -128,6 +129,7 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> FixS
             lines.append((name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip()))
     lines += [("constraint", _constraint_text(active)) for active in active_of(fix)]
     known = known_rows(fix)
+    # Without a valid position, the known quantities replace the intervals of the position.
     lines += known if known and not has_place(fix) else _extents(fix) + known
     lines.append(("chi-square", _chi_square(fix)))
     if hasattr(fix.certificate, "proof"):
@@ -154,7 +156,8 @@ def whose(columns: Columns, i: int) -> str:
 def _state(columns: Columns, i: int, whose: str) -> list[tuple[str, str]]:
     """Return labels and texts of the state in row `i`: position, velocity, acceleration and accuracy.
 
-    `whose` is added to each label, to name target and epoch. A row without a position has no lines.
+    `whose` is added to each label, to name target and epoch. A row without a position has no lines. The ellipse is
+    omitted if the distribution is not Gaussian in metres. `columns` is the table of the fix.
     """
     if not np.isfinite(columns["x"][i]):
         return []
@@ -242,7 +245,10 @@ def _coordinates(fix: Fix) -> list[tuple[str, str]]:
 
 
 def _chi_square(fix: Fix) -> str:
-    """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is small."""
+    """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is small.
+
+    Without redundancy or without a finite cost, the text states that there is no test.
+    """
     if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
         return "no redundancy: nothing to test"
     p = float(fix.p_value)
@@ -301,7 +307,10 @@ def suspect_sheet(fix: Fix) -> FixSheet | None:
 
 
 def _error(suspect: Suspect) -> str:
-    """Return the text of the estimated errors of a suspect, each with its standard deviation."""
+    """Return the text of the estimated errors of a suspect, each with its standard deviation.
+
+    At most three errors are listed. Errors that the other rows do not determine are omitted.
+    """
     pairs = [f"{e:+.3g} ± {s:.2g}" for e, s in zip(suspect.error, suspect.sigma, strict=True) if np.isfinite(s)]
     return ", ".join(pairs[:3]) + (" ..." if len(pairs) > 3 else "") if pairs else "unknown"
 
@@ -326,7 +335,10 @@ def alternative_sheet(fix: Fix) -> FixSheet | None:
 
 
 def count_sheet(columns: Columns, title: str) -> FixSheet:
-    """Return a sheet of a batch: for each status the number of fixes, their sigmas and their p-value."""
+    """Return a sheet of a batch: for each status the number of fixes, their sigmas and their p-value.
+
+    `columns` is the table of the batch, and `title` is the first part of the title of the sheet.
+    """
     # One number for the accuracy of a position: the root of the trace of its covariance.
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     rows = []
@@ -395,6 +407,7 @@ def determined_of(fix: Fix) -> Determined | None:
     """Return the quantities that the data of a single fix determine; raise InvalidProblem for a batch.
 
     If the fix does not refer to its problem, only the intervals of an `ok` fix are known; otherwise the result is None.
+    The first call computes the quantities, and the fix keeps them for later calls.
     """
     if fix.shape:
         advice = "select one fix: fix[i].determined"

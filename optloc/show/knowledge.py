@@ -72,7 +72,10 @@ def _centre_text(found: Determined) -> str:
 
 
 def _direction_text(found: Determined, direction: Direction) -> str:
-    """Return the text of a direction with its cone, degrees."""
+    """Return the text of a direction with its cone, degrees.
+
+    `found` are the quantities of the fix; they state whether azimuths convert to bearings from north.
+    """
     if found.north:
         middle, low, high = bearing_of(direction.azimuth)
         text = f"bearing {_angle_text(middle, low, high)}"
@@ -86,7 +89,8 @@ def _direction_text(found: Determined, direction: Direction) -> str:
 def _angle_text(middle: float, low: float, high: float) -> str:
     """Return the text of an angle with its interval, degrees.
 
-    The width of the interval sets the number of digits: one digit more than the width needs.
+    The width of the interval sets the number of digits: one digit more than the width needs. `middle` is the angle, and
+    `low` and `high` are the ends of the interval. If the interval is a full turn, the angle is not determined.
     """
     width = high - low
     if width >= 360.0:
@@ -104,7 +108,7 @@ def _range_text(direction: Direction) -> str:
 
 
 def _quantity_text(quantity: Quantity) -> str:
-    """Return the text of an interval."""
+    """Return the text of the interval of a quantity; angles are printed in degrees, and an end may be infinite."""
     value, low, high, unit = quantity.value, quantity.low, quantity.high, quantity.unit
     if unit == "rad":
         return _angle_text(*np.degrees([value, low, high]).tolist())
@@ -134,6 +138,7 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
     assert found is not None
     features: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for one, about in zip(shown_directions(fix, found), found.to_dict()["directions"], strict=False):
+        # The geometry shows the direction and the edge of the cone.
         kept = {name: value for name, value in about.items() if name not in ("vector", "outline")}
         reach = reach_of(fix, one)
         wedge = polygon_geometry([[earth_line(frame, _with_points_between(found.wedge(one, reach)))]])
@@ -147,7 +152,11 @@ def known_features(fix: Fix, frame: Frame) -> list[tuple[dict[str, Any], dict[st
 
 
 def reach_of(fix: Fix, direction: Direction) -> float:
-    """Return the distance, m, at which the wedge of an unlimited direction ends."""
+    """Return the distance, m, at which the wedge of a direction without an upper limit of its range ends.
+
+    `fix.reach` is the greatest distance of a station from the mean of the stations, m; it counts as zero if it is
+    unknown. The result is at least 1 m.
+    """
     size = 0.0 if fix.reach is None else float(np.nan_to_num(fix.reach))
     return float(np.clip(max(_LEAST * direction.least_range, _SIZES * size), 1.0, _MOST))
 
@@ -158,7 +167,7 @@ _PIECES = 16
 
 
 def _with_points_between(line: Array) -> Array:
-    """Return a line (n, d) with extra points between its corners."""
+    """Return a line (n, d) with extra points between its corners, `_PIECES` pieces for each edge."""
     share = np.arange(_PIECES)[:, None] / _PIECES
     parts = [start + share * (end - start) for start, end in pairwise(line)]
     return np.concatenate([*parts, line[-1:]])

@@ -68,18 +68,20 @@ def land(window: Window) -> list[Array]:
 def _clip_ring(ring: Array, window: Window) -> Array:
     """Return a ring (n, 2) clipped to a window, degrees.
 
-    The ring is clipped at one side of the window after the other. Source: I. E. Sutherland and G. W. Hodgman,
-    "Reentrant polygon clipping", Communications of the ACM 17 (1974).
+    The ring is clipped at one side of the window after the other; the result is empty if the ring is outside. Source:
+    I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
     """
     for axis, limit, sign in ((0, window[0], 1.0), (0, window[1], -1.0), (1, window[2], 1.0), (1, window[3], -1.0)):
         if not len(ring):
             return ring
+        # Distance inside this side, negative outside; each corner is compared with the corner before it.
         depth = sign * (ring[:, axis] - limit)
         before, depth_before = np.roll(ring, 1, axis=0), np.roll(depth, 1)
         crosses = (depth >= 0.0) != (depth_before >= 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             share = depth_before / (depth_before - depth)
             edge = before + np.where(crosses, share, 0.0)[:, None] * (ring - before)
+        # The point on the side comes before the corner; keep points where an edge crosses, and corners inside.
         both = np.stack([edge, ring], axis=1).reshape(-1, 2)
         ring = both[np.stack([crosses, depth >= 0.0], axis=1).ravel()]
     return ring
@@ -344,6 +346,7 @@ def spots(
         axes = problem.frame.enu_axes(centre)[:2]
         if regions:
             lines = [degrees(problem, centre + line @ axes) for region in regions for line in region.lines]
+            # The outline with most points is the ring of the mark; all other outlines go to `more`.
             lines.sort(key=len, reverse=True)
             rings.append(lines[0])
             more += lines[1:]
@@ -364,7 +367,10 @@ def degrees(problem: Problem, position: Array) -> Array:
 
 
 def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -> Spots:
-    """Return the marks of fixes; `labels` are their names if there is one label for each position."""
+    """Return the marks of fixes; `labels` are their names if there is one label for each position.
+
+    A run has several positions but one status. Its marks then have the text "status not ok" or no status.
+    """
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
     status = [
@@ -380,6 +386,7 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     for i, regions in enumerate(outlines):
         sentences[i] += ", 95 % region larger than drawn" if any(region.cut for region in regions) else ""
     found = spots(problem, position, covariance, clean, sentences, outlines)
+    # Mark ellipses that are not valid, if no outline of the valid region replaces them.
     return replace(found, local=is_local(fixes, [bool(each) for each in outlines], len(position)))
 
 
@@ -393,7 +400,10 @@ def sentence(name: str, status: str, place: Array, sigma: float) -> str:
 
 
 def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
-    """Return the marks of the alternatives of fixes."""
+    """Return the marks of the alternatives of fixes, without ellipses: positions of other minima of the cost.
+
+    Positions that change from epoch to epoch have no marks.
+    """
     places, text = [np.zeros((0, problem.dimension))], []
     for fix in fixes:
         flat = fix if len(fix.shape) == 1 else fix.flat()
@@ -423,6 +433,7 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
     """
     indices = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
     found = []
+    # -1 is the first of the sorted numbers: it means no station.
     for station in np.unique(np.concatenate([*indices, [-1]]))[1:].tolist():
         track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
         lat, lon, height = problem.frame.to_geodetic(thinned(track))
@@ -445,6 +456,7 @@ def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, 
         return []
     lon, lat = _grid_beyond(*limits[:2]), np.clip(_grid_beyond(*limits[2:]), -_POLE, _POLE)
     height = float(problem.frame.to_geodetic(flat.take("position")[0])[2])
+    # Longitudes and latitudes of all grid points, radians.
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
     # The grid continues beyond the antimeridian: wrap its longitudes to ±180 degrees.
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))

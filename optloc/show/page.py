@@ -186,7 +186,9 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     _on_earth(problem.frame.geodetic)
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
     found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
+    # Lines of position need a single fix.
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
+    # Number of fixes without redundancy.
     alone = sum(int(np.sum(fix.unchecked)) for fix in several)
     count = sum(fix.code.size for fix in several)
     which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
@@ -194,7 +196,11 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
-    """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks."""
+    """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks.
+
+    `problem` gives the stations, and `title` is the title of the page. If the frame is not on Earth, the function
+    raises InvalidProblem.
+    """
     _on_earth(problem.frame.geodetic)
     return _marks_page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
 
@@ -227,6 +233,8 @@ def live_page(problem: Problem, title: str) -> str:
 
 def map_page(found: BoundMap, title: str) -> str:
     """Return an HTML page with the interactive map of a bound; the page needs no network.
+
+    `found` is the bound over a grid, and `title` the title of the page.
 
     Raises
     ------
@@ -293,7 +301,9 @@ def _map_limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
     # Move all longitudes to within 180 degrees of the first point.
     points = _shift_near(points, points[0, 0])
     low, high = points.min(0), points.max(0)
+    # A degree of longitude is shorter than a degree of latitude by this factor.
     squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
+    # Half the width and height with margins, in degrees of latitude; `_LEAST` replaces the extent of a single point.
     half = (0.5 + _RIM) * np.maximum(
         (high - low) * squeeze, _SLIMMEST * float(((high - low) * squeeze).max() or _LEAST)
     )
@@ -313,6 +323,7 @@ def _focus(marks: Spots, plane: Plane, middle: float) -> list[float] | None:
 
     The width is three times the size of its ellipse. `middle` is the longitude of the middle of the map, degrees. The
     result is None if the width is at least half the width of the map, or if there are several marks or no ellipse.
+    `plane` is the projection of the map.
     """
     rings = [ring for ring in marks.rings if len(ring)]
     if len(marks.place) != 1 or not rings:
@@ -351,9 +362,11 @@ def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
 
 
 def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are too many.
+    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are more than `_ELLIPSES`.
 
-    Ellipses that are not valid have another class, so that the style sheet draws them dotted.
+    All valid ellipses and outlines are one curve, and all other ellipses another curve. `middle` is the longitude of
+    the middle of the map, degrees. Ellipses that are not valid have another class, so that the style sheet draws them
+    dotted. `plane` is the projection of the map.
     """
     if len(marks.rings) > _ELLIPSES:
         return []
@@ -372,7 +385,10 @@ def _ellipses(marks: Spots, plane: Plane, middle: float) -> list[Drawn]:
 
 
 def _dots(marks: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
-    """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position."""
+    """Return marks as dots of `size` pixels: blue if the status is `ok`, else orange; none for a missing position.
+
+    `middle` is the longitude of the middle of the map, degrees. `plane` is the projection of the map.
+    """
     return [
         dot(x, y, BLUE if ok else ORANGE, size, text)
         for (x, y), ok, text in zip(plane(_shift_near(marks.place, middle)), marks.clean, marks.text, strict=True)
@@ -425,7 +441,10 @@ def _metres(level: float) -> str:
 
 
 def _image(found: BoundMap, plane: Plane) -> Image:
-    """Return the bound as a picture for the map: one pixel for each grid point, transparent where there is no bound."""
+    """Return the bound as a picture for the map: one pixel for each grid point, transparent where there is no bound.
+
+    `found` is the bound over a grid, and `plane` is the projection of the map.
+    """
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
     from matplotlib.image import imsave
@@ -437,6 +456,7 @@ def _image(found: BoundMap, plane: Plane) -> Image:
     # Cells without a bound are transparent.
     rgba[~np.isfinite(found.sigma)] = 0.0
     file = BytesIO()
+    # The first row of a picture is at the top, the first row of the bound in the south.
     imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
     # Grid points are centres of pixels, so the picture extends half a step beyond the grid.
     dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
@@ -446,7 +466,10 @@ def _image(found: BoundMap, plane: Plane) -> Image:
 
 
 def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
-    """Return the isolines of the bound as curves, with one label for each level."""
+    """Return the isolines of the bound as curves, with one label for each level.
+
+    `found` is the bound over a grid, and `plane` is the projection of the map.
+    """
     parts: list[Drawn] = []
     for level, lines in isolines(found):
         drawn = [plane(line) for line in lines]
@@ -468,7 +491,7 @@ def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
 def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
     """Return at most `_DOTS` trials as dots at longitude and latitude `places` (n, 2), degrees.
 
-    Trials with a wrong result, marked by `off` (n,), are orange and larger.
+    Trials with a wrong result, marked by `off` (n,), are orange and larger. `plane` is the projection of the map.
     """
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
     order = kept[np.argsort(off[kept], kind="stable")]  # Draw wrong trials last, on top.
@@ -482,7 +505,7 @@ def _data(found: BoundMap) -> dict[str, Any]:
     """Return the values from which the script of the page reads the bound at the pointer.
 
     `x` and `y` are first and last grid line, degrees, and their number. `values` are the bounds in m, row by row from
-    the south; None where there is no bound.
+    the south; None where there is no bound. `found` is the bound over the grid.
     """
     return {
         "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],

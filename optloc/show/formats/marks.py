@@ -180,7 +180,8 @@ def mark_of(
 def ellipse(level: Array) -> tuple[float, float, float]:
     """Return the 1-sigma semi-axes of a level covariance, m, and the bearing of the major axis, degrees.
 
-    The bearing counts from north towards east, 0 to 180. `level` has at least the axes east and north.
+    The bearing counts from north towards east, 0 to 180. `level` (d, d) has the axes east, north and, in space, up; the
+    vertical axis is not used.
     """
     values, vectors = np.linalg.eigh(level[:2, :2])
     minor, major = np.sqrt(np.maximum(values, 0.0))
@@ -263,6 +264,7 @@ class Results:
         """
         axes = self.axes
         number = {name: np.nan if row.get(name) is None else row[name] for name in row}
+        # The table has the upper triangle only, so the letters of a column are in alphabetical order.
         pairs = [["cov_" + "".join(sorted(a + b)) for b in axes] for a in axes]
         other_chart = row.get("chart") not in (None, "", NAMES[CARTESIAN])
         covariance = np.array([[np.nan if other_chart else number[name] for name in line] for line in pairs])
@@ -360,7 +362,10 @@ def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:
 
 
 def _ellipse(frame: Frame, centre: Array, level: Array) -> dict[str, Any]:
-    """Return the horizontal 95 % ellipse of a level covariance (2, 2), m^2, as a counter-clockwise GeoJSON geometry."""
+    """Return the horizontal 95 % ellipse of a level covariance (2, 2), m^2, as a counter-clockwise GeoJSON geometry.
+
+    The ellipse is centred at the position `centre` (d,), m, in the frame `frame`.
+    """
     from optloc.show.pictures.outlines import earth_line, polygon_geometry
 
     semi_axes, directions = error_ellipse(level)
@@ -381,6 +386,7 @@ def geojson(results: Results) -> dict[str, Any]:
 
     need_earth(results.frame, "GeoJSON", results.title)
     features = [feature(point_geometry(place), {"role": "station", "name": name}) for name, place in results.stations()]
+    # The geometry holds the position, and the region replaces the covariance.
     skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
     rows = records(results.columns)
     for row, mark, area, known in zip(rows, results.marks(), results.areas(), results.known(), strict=True):

@@ -50,7 +50,10 @@ def _number(value: float, digits: int = _METRES) -> str:
 
 
 def _courses(marks: Sequence[Mark]) -> Iterator[tuple[str, list[list[Mark]]]]:
-    """Yield each target with the parts of its track; a part ends where the track is lost."""
+    """Yield each target with the parts of its track.
+
+    A part is a sequence of marks that are `sure`. It ends at the first mark that is not, where the track is lost.
+    """
     for target in dict.fromkeys(mark.target for mark in marks):
         marks_of_target = (mark for mark in marks if mark.target == target)
         yield target, [list(part) for sure, part in groupby(marks_of_target, key=lambda mark: mark.sure) if sure]
@@ -96,7 +99,7 @@ def kml(results: Results) -> str:
 def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
     """Add a mark to a KML document: its position, its 95 % region and its alternatives.
 
-    A mark without a position is a placemark without a geometry.
+    A mark without a position is a placemark without a geometry. `area` is the region; None if it is not known.
     """
     if not mark.known:
         _placemark(document, mark.name, mark.words, "doubtful", mark)
@@ -297,7 +300,8 @@ def _event(
     """Return one event of Cursor on Target as XML text on one line.
 
     `place` (3,) is longitude, latitude (degrees) and height (m). `errors` are `ce` and `le`, m. `atom` is the type of
-    the event, and `about` a remark. With `moves`, course and speed of the mark are added.
+    the event, and `about` a remark. With `moves`, course and speed of the mark are added. `name` is the name of the
+    object, and a part of the id of the event.
     """
     now = datetime.now(UTC)
     start = mark.date or now

@@ -25,7 +25,10 @@ _MINUTES = 7
 
 
 def nmea(results: Results) -> str:
-    """Return a GGA sentence for each mark, and a GST sentence for each mark with a valid covariance."""
+    """Return a GGA sentence for each mark, and a GST sentence for each mark with a valid covariance.
+
+    The last line has no line feed, because the writer of a text file adds it.
+    """
     return "".join(map(sentences, results.marks())).removesuffix("\n")
 
 
@@ -46,6 +49,7 @@ def sentences(mark: Mark) -> str:
         return line
     major, minor, bearing = ellipse(mark.level)
     sigma = np.sqrt(np.maximum(np.diagonal(mark.level), 0.0))
+    # The fields of GST are latitude, longitude and height; the axes of the covariance are east, north and up.
     sizes = [f"{v:.3f}" for v in (sigma[1], sigma[0], *sigma[2:])]
     rise = [] if len(sigma) == 3 else [""]
     return line + _sentence("GST", clock, "", f"{major:.3f}", f"{minor:.3f}", f"{bearing:.1f}", *sizes, *rise)
@@ -90,6 +94,7 @@ def _pose(mark: Mark, frame: str) -> str:
     if not (mark.sure and mark.covers):
         return _comment(mark)
     d = len(mark.position)
+    # The axes of a pose are x, y, z and three rotations.
     covariance = np.diag(np.full(6, _OPEN))
     covariance[:d, :d] = mark.covariance
     when = mark.time if np.isfinite(mark.time) else 0.0

@@ -64,6 +64,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
 
     values, name = _drawn(found, dilution=dilution)
     steps = levels(values)
+    # The scale spans at least a factor of two, otherwise it has only one colour.
     norm = LogNorm(steps[0], max(steps[-1], steps[0] * 2.0))
     return _draw(found, values, steps, norm, name, title)
 
@@ -92,7 +93,8 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
 def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
     """Return a map of values (ny, nx) with isolines at the values `steps`.
 
-    `norm` converts values to colours, and `name` is the label of the colour scale.
+    `norm` converts values to colours, and `name` is the label of the colour scale. `grid` holds the grid points, m or
+    degrees, and the stations.
     """
     scale = 1.0 if grid.geodetic or max(np.ptp(grid.x), np.ptp(grid.y)) < _FAR else 1e-3
     x, y = grid.x * scale, grid.y * scale
@@ -154,7 +156,8 @@ def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
 def levels(values: Array) -> list[float]:
     """Return the levels of isolines, 1, 2, 5 times powers of ten, around the middle 98 % of the values.
 
-    Few levels are refined, and of many levels only some remain.
+    If there are few levels, round numbers between them are added. If there are more than `_LEVELS`, only powers of ten
+    or every second level remain.
     """
     good = values[np.isfinite(values) & (values > 0.0)]
     # Near stations the bound approaches zero, and far away it approaches infinity: the outer 1 % at either end has no
@@ -162,6 +165,7 @@ def levels(values: Array) -> list[float]:
     low, high = (float(np.quantile(good, share)) for share in (0.01, 0.99))
     decades = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)
     steps = [step * 10.0**power for power in decades for step in _STEPS]
+    # The last level below the values and the first level above them, at least two levels.
     first = max(i for i, step in enumerate(steps) if step <= low)
     last = min((i for i, step in enumerate(steps) if step >= high), default=len(steps) - 1)
     chosen = steps[first : max(last, first + 1) + 1]

@@ -123,6 +123,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     finish(figure, title, panels[:1])
     # Limits of a plan are final only after the layout of the figure.
     figure.draw_without_rendering()
+    # The plans are the first panel and, with the surroundings, the last panel.
     for panel in panels[:: len(panels) - 1] if near else panels[:1]:
         if panel.axison:
             style.scale_bar(panel, panel.get_xlabel().rpartition("(")[2].rstrip(")"))
@@ -184,6 +185,7 @@ def _draw_directions(panel: Axes, problem: Problem, fixes: Sequence[Fix], size: 
     found = fixes[0].flat()[0].determined
     if found is None:
         return
+    # Long enough to cross the plan; `autolim=False` keeps the limits of the plan.
     reach = size * _BEYOND * float(np.ptp((panel.get_xlim(), panel.get_ylim()), axis=1).max())
     wedges = [_horizontal(problem, found.wedge(one, reach, whole=True)) / size for one in found.directions]
     rays = [_horizontal(problem, found.ray(one, reach)) / size for one in found.directions]
@@ -205,7 +207,10 @@ def _horizontal(problem: Problem, line: Array) -> Array:
 
 
 def _needs_surroundings(scene: PictureScene) -> bool:
-    """Return whether the fixes are so close together that the picture needs a panel around them."""
+    """Return whether the fixes are so close together that the picture needs a panel around them.
+
+    The result is also True if no fix has a position; the panel then contains only a text.
+    """
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
         return True
@@ -417,6 +422,7 @@ def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -
     places = np.concatenate([places, answer.position.reshape(1, -1)])
     velocity = answer.velocity.reshape(-1) if flat.motions[target].order else np.zeros(flat.dimension)
     found = []
+    # The zero lines of the value minus the value at the fix are the curves.
     for rows, row in _chosen_rows(rates, target):
         value = _rate(flat, rows, row, places, velocity)
         excess = np.ma.masked_invalid((value[:-1] - value[-1]).reshape(len(y), len(x)))
@@ -439,10 +445,11 @@ def _chosen_rows(rates: Sequence[Rows], target: int) -> list[tuple[Rows, int]]:
 def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array) -> Array:
     """Return the modelled value (n,) of a row, m/s, for a target at positions (n, d), m, with `velocity` (d,), m/s.
 
-    `row` is the number of the row in `rows`.
+    `row` is the number of the row in `rows`. `places` are the positions.
     """
 
     def at(array: Array | None, index: int) -> tuple[float, ...]:
+        # Position or velocity of a station at the epoch of the row; stations at rest have one epoch.
         if array is None:
             return (0.0,) * problem.dimension
         epoch = rows.epoch[row] if array.shape[-3] > 1 else 0
@@ -475,7 +482,7 @@ def _third_coordinate(frame: Frame, plan: Array, height: float) -> Array:
     """Return the third coordinate (n,), m, of points above a plan that have a given height above the ellipsoid.
 
     `frame` has the axes east, north and up, and `plan` (n, 2) are the first two coordinates, m. A point beyond the
-    horizon gets NaN.
+    horizon gets NaN. The method is Newton iteration from the surface of a sphere.
     """
     across = np.linalg.norm(plan, axis=1)
     near = across < _STEEP

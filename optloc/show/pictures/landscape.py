@@ -284,6 +284,7 @@ def _draw_inset(panel: Axes, scene: PictureScene) -> None:
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
     style.ellipses(near, moved, PLAN, size)
     near.scatter(0.0, 0.0, s=30, color=BLUE, zorder=4)
+    # More room below the fix, for the scale bar.
     near.set(
         xlim=(-half / size, half / size),
         ylim=(-1.3 * half / size, 0.7 * half / size),
@@ -308,6 +309,7 @@ def _draw_ends(panel: Axes, found: Basins, x: Array, y: Array) -> None:
     """Colour each start by the result of its iteration; `x` and `y` are the grid lines in the unit of the axes."""
     from matplotlib.colors import ListedColormap
 
+    # The results are the numbers 0, 1 and 2: the limits of the scale put each number in the middle of its colour.
     colours = ListedColormap([_COLOURS[end] for end in End])
     panel.pcolormesh(x, y, found.ends, cmap=colours, vmin=-0.5, vmax=2.5, rasterized=True, shading="nearest")
 
@@ -339,6 +341,7 @@ def _add_legend(figure: Figure, panel: Axes) -> None:
 
     patches = [Patch(facecolor=_COLOURS[end], label=f"a start here leads to {_ENDS[end]}") for end in End]
     handles, labels = panel.get_legend_handles_labels()
+    # Each label once.
     kept = dict(zip(labels, handles, strict=True))
     shown = [*patches, *kept.values()]
     names = [*(str(patch.get_label()) for patch in patches), *kept]

@@ -58,6 +58,7 @@ def outlines_of(problem: Problem, fix: Fix, planes: Sequence[Array], level: floa
         if shaped[i]:
             one, fixed = problems.take(np.array([i])), flat[i]
             made = [outline_of(one, fixed, plane if plane.ndim == 2 else plane[i], level) for plane in planes]
+        # One unknown outline makes the region unknown, because a picture needs all planes of a fix.
         found.append([] if any(one is None for one in made) else [one for one in made if one is not None])
     return found
 
@@ -137,7 +138,10 @@ def polygon_geometry(polygons: Sequence[Sequence[Array]], digits: int = _DIGITS)
 
 
 def earth_line(frame: Frame, line: Array) -> Array:
-    """Return a line (n, d), m, as longitude, latitude (degrees), height (m) (k, 3), with extra points near a pole."""
+    """Return a line (n, d), m, as longitude, latitude (degrees), height (m) (k, 3), with extra points near a pole.
+
+    Points are added in the middle of an edge until its ends differ by at most `_STEP` in longitude.
+    """
     place = earth_points(frame, line)
     for _ in range(_HALVINGS):
         wide = np.abs((np.diff(place[:, 0]) + 180.0) % 360.0 - 180.0) > _STEP
@@ -178,6 +182,8 @@ def _parts_between_crossings(line: Array) -> list[Array]:
     parts, part = [], [line[0]]
     for one, two in pairwise(line):
         if abs(two[0] - one[0]) > 180.0:  # The shorter way between the points crosses the antimeridian.
+            # The line leaves the map at the longitude `side`. `before` and `after` are the differences in longitude
+            # between the crossing and its two neighbours.
             side = float(np.copysign(180.0, one[0]))
             before, after = side - one[0], two[0] + side
             middle = one + before / (before + after) * (two - one)
@@ -208,6 +214,7 @@ def _cut_polygon(rings: Sequence[Array]) -> list[list[Array]]:
     if not parts:
         return [whole]
     outers = [[line] for line in _join_along_edge(parts)]
+    # A line that crosses nothing is a hole of the outline that holds it.
     for hole in whole:
         next((piece for piece in outers if holds(piece[0][:, :2], hole[0])), outers[0]).append(hole)
     return outers
@@ -217,7 +224,7 @@ def _join_along_edge(parts: list[Array]) -> list[Array]:
     """Return closed lines from parts that begin and end on the edge of the map, joined along the edge.
 
     From the end of a part, the next start along the edge, counter-clockwise, continues the line. Corners of the map
-    between them become points of the line.
+    between them become points of the line. A line is closed when the next start is the start of its first part.
     """
     begins = [_distance_along_edge(part[0]) for part in parts]
     unused, found = set(range(len(parts))), []
@@ -225,11 +232,13 @@ def _join_along_edge(parts: list[Array]) -> list[Array]:
         first = here = min(unused)
         line: list[Array] = []
         while here != first or not line:
+            # `here` is the current part, and `first` the part with which the line began.
             unused.discard(here)
             line.append(parts[here])
             end = _distance_along_edge(parts[here][-1])
             here = min({*unused, first}, key=lambda i: (begins[i] - end) % _AROUND)
             way = (begins[here] - end) % _AROUND
+            # Add the corners of the map between the end and the next start; heights stay the same.
             for corner, place in sorted(_EDGES.items(), key=lambda each: (each[0] - end) % _AROUND):
                 if (corner - end) % _AROUND < way:
                     line.append(np.array([[*place, *line[-1][-1, 2:]]]))
@@ -238,5 +247,8 @@ def _join_along_edge(parts: list[Array]) -> list[Array]:
 
 
 def _distance_along_edge(place: Array) -> float:
-    """Return the distance along the edge of the map, degrees, of a point on its left or right side."""
+    """Return the distance along the edge of the map, degrees, of a point on its left or right side.
+
+    The distance counts counter-clockwise from the lower right corner.
+    """
     return float(90.0 + place[1] if place[0] > 0.0 else 630.0 - place[1])

@@ -123,7 +123,8 @@ def _draw(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
 def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[Figure, Any]:
     """Return a figure with one panel below the other, one for each entry of `counts`.
 
-    The height of a panel follows its number of lines; `width` and `line` are in inches.
+    An entry is the number of lines of a panel, which sets its height. `width` of the figure and height `line` of a line
+    are in inches.
     """
     tall = [max(2, count) for count in counts]
     size = (width, 1.1 + sum(0.9 + line * n for n in tall))
@@ -134,7 +135,8 @@ def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[F
 def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     """Draw the residuals of one kind, one line for each station or pair.
 
-    Few residuals are single points. Many residuals are a box of the middle half with a line of 95 %.
+    Few residuals are single points. Many residuals are a box of the middle half with a line of 95 %. `sets` are the
+    residuals by the names of the stations or pairs.
     """
     unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
     # Use milliradians: residuals in radians have too many zeros.
@@ -211,7 +213,10 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
 
 
 def _groups_to_draw(health: Health, unit: str) -> Array:
-    """Return the groups of a unit to draw: those with the most fixes, sorted by bias."""
+    """Return the numbers of the groups of a unit to draw: those with the most fixes, sorted by bias.
+
+    A group is a station, a pair of stations or a kind, see `Health`.
+    """
     numbers = np.flatnonzero(np.array(health.units) == unit)
     numbers = numbers[np.argsort(-health.count[numbers], kind="stable")[:_SHOWN]]
     return numbers[np.argsort(np.nan_to_num(health.bias[numbers]), kind="stable")]
@@ -225,6 +230,7 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     place = np.arange(len(groups))
     quantiles = np.array([np.percentile(_well_checked(health, g), (*_WHISKERS, *_MIDDLE, 50.0)) for g in groups]).T
     factor, shown = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
+    # whiskers, ends of the box and median
     low, high, left, right, middle = factor * quantiles
     panel.hlines(place, low, high, color=GREY, linewidth=1.2, label="95 % of residuals")
     panel.barh(

@@ -142,11 +142,13 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     """Draw the bound of one family of unknowns against time.
 
     A state of a target has a curve for each axis and for all axes together. A large family of biases has one curve, the
-    root mean square.
+    root mean square. `known` is the bound with known biases, or None. `course` is the bound of all unknowns, and `slot`
+    is the place of the family in the vector of unknowns.
     """
     word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
     sigma, entries = course.sigma(slot.name), slot.entries
     if slot.members and slot.size > _MANY:
+        # `total` is the root of the sum of squares of all members.
         entries, sigma = ("root mean square",), course.total(slot.name)[:, None] / np.sqrt(slot.size)
     for entry, values, colour in zip(entries, sigma.T, _COURSE_COLOURS * 2, strict=False):
         label = f"{word} {entry}".strip() if slot.members else f"along {entry}"
@@ -208,7 +210,8 @@ def plot_biases(
 def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None) -> None:
     """Draw the estimates of one family against time with their 95 % intervals.
 
-    If `truth` is given, the true values are drawn as dotted lines.
+    If `truth` is given, the true values are drawn as dotted lines. `found` are the estimates, and `slot` is the place
+    of the family in the vector of unknowns.
     """
     values, sigma = found.take(slot.name)
     for i, entry in enumerate(slot.entries[:_MOST]):

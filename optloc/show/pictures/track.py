@@ -119,7 +119,10 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
 
 
 def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
-    """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes."""
+    """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes.
+
+    `drawn` are at least one track; the first track gives the stations and the frame.
+    """
     first = drawn[0].problem
     d = first.dimension
     stations = first.stations.position.reshape(-1, first.stations.count, d)[0]
@@ -159,7 +162,10 @@ def _with_colours(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
 
 
 def _draw_plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[str]) -> None:
-    """Draw the plan: stations near the tracks, tracks with their starts and their bad scans, and ellipses."""
+    """Draw the plan: stations near the tracks, tracks with their starts and their bad scans, and ellipses.
+
+    `lines` are the tracks, and `axes` the names of the axes.
+    """
     position = np.concatenate([line.position for line in lines])[:, :2]
     known = position[np.isfinite(position).all(-1)]
     spots = stations[_is_near(stations[:, :2], known), :2]
@@ -225,7 +231,10 @@ def _draw_sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
 
 
 def _draw_innovations(panel: Axes, lines: Sequence[_Line]) -> None:
-    """Draw the NIS, and the 99.9 % quantile of chi-square for the number of rows of each scan."""
+    """Draw the NIS, and the 99.9 % quantile of chi-square for the number of rows of each scan.
+
+    `lines` are the tracks; scans without a test have no point and no line.
+    """
     from scipy.special import gammaincinv
 
     # The NIS of m rows is chi-square with m degrees of freedom, so the line depends on the number of rows of each scan.
