@@ -114,7 +114,7 @@ class Likelihood:
         coordinates, and the pulses.
         """
         net, problem, (j, r) = self.network, self.problem, rows_of(self.network)
-        # `far` is the prior sigma of free coordinates about their start: the tether, or very wide.
+        # `far` is the prior sigma of free coordinates about their start: the tether, or a wide one.
         known = np.isfinite(net.place_sigma)
         place = np.where(known, net.place, at.stations)
         exact = _EXACT * (float(np.ptp(at.stations)) or 1.0)
