@@ -307,7 +307,10 @@ def _spare_still(room: EngineWorkspace, axis: int) -> None:
 
 @compiled
 def _note(scalar: Array, high: Array, low: Array) -> None:
-    """Update the greatest (`high`) and the least (`low`) rise of the cost (W,), relative to a quadratic cost."""
+    """Update the greatest (`high`) and the least (`low`) rise of the cost (W,), over the rise of a quadratic cost.
+
+    In `scalar`, COST_TRIAL is the cost at the probe, COST the cost of the fix, and SHARE one over the quadratic rise.
+    """
     for lane in range(LANES):
         rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
         # NaN means far from quadratic, and every comparison with NaN is false

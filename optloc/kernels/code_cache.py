@@ -137,7 +137,10 @@ def _entries() -> tuple[Any, Any]:
 
 
 def _fields(kind: Any) -> tuple[Any, ...]:
-    """Return the names of the fields of a numba type, nested for the types inside it; () for a type without fields."""
+    """Return the names of the fields of a numba type, nested for the types inside it; () for a type that is no tuple.
+
+    The names are part of the key of an entry. Otherwise machine code for an old order of fields would be read.
+    """
     from numba.core import types
 
     numba: Any = types  # half typed

@@ -126,14 +126,16 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
 
 
 def _above_any_place(problem: Problem, there: Array, at: Array, part: Array, tangents: Array, j: int) -> Array:
-    """Return the lowest cost (N,) of distant waves with one free factor; a position is a tilt of the wave front.
+    """Return the lowest cost (N,) of waves from distant positions above the stations' plane, with one unknown factor.
 
+    See `cost_beyond_speed`. The cost is minimised over the factor, a tilt of the wave front and the other unknowns. A
+    step of the distant position along the plane only tilts the wave front, so the tilt replaces the position.
     `there` (N, size) are vectors with distant positions. `at` (N, size) are the fixes, at which the noise of station
     errors is computed. `part` (d,) are the columns of the position, and `j` is the column of the factor. `tangents`
     (N, d, d - 1) span the plane of the stations.
     """
     residual, design = _rows(problem, there, at)
-    # the factor multiplies only these rows; only they receive a tilt
+    # Only rows that the factor multiplies receive a tilt.
     touched = (design[..., j] != 0.0)[..., None]
     tilt = np.where(touched, design[..., part] @ tangents, 0.0)
     rest = np.setdiff1d(np.arange(design.shape[-1]), np.append(part, j))

@@ -258,7 +258,7 @@ class _Legs(NamedTuple):
     Parameters
     ----------
     h, c1, c2 : array (L, n)
-        Heights of the legs, and speeds at their ends.
+        Heights of the legs, metres, and speeds at their ends, m/s. A leg is the part of a ray in one layer.
     times : array (L, 1)
         Number of passes through each leg.
     short1, short2 : array (L, n)
@@ -266,7 +266,7 @@ class _Legs(NamedTuple):
     top : array (n,)
         Greatest speed of the legs, at which the angle is defined.
     turn, slope : array (n,)
-        Speed at the start of the turning leg, and its increase per metre; NaN without a turning leg.
+        Speed at the start of the turning leg, and its increase per metre. If the n rays do not turn, all are NaN.
     """
 
     h: Array

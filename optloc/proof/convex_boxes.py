@@ -61,7 +61,8 @@ def set_convex(cost: Cost, chart: LocalAxes, box: Box, hull: Array, margin: floa
 def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
     """Return whether a box (centre `at`, half-widths `half`) is inside the convex box of a known minimum.
 
-    `minima` (P, 3) are the minima, and `sides` (P, 3) the half-widths of their convex boxes.
+    `minima` (P, 3) are the minima, and `sides` (P, 3) the half-widths of their convex boxes. All arguments are in one
+    system, the search coordinates of `known_minima`.
     """
     for p in range(minima.shape[0]):
         inside = True

@@ -82,7 +82,9 @@ def contract_at_infinity(box: Box, last: int, end: float) -> None:
 def push_rest(stack: Array, size: int, cut: Array, at: Array, half: Array, side: int, low: float, piece: int) -> int:
     """Push the part of a box between the ends of `cut`, whole or halved across a side; return the size of the stack.
 
-    The part is pushed whole if it is less than the share `SHRUNK` of the box, and not at all if it is empty.
+    `cut` (6,) has the lower and then the upper ends along the three coordinates, relative to the centre. `at` and
+    `half` are overwritten by the part. `side` is the number of the coordinate to halve. The part is pushed whole if it
+    is less than the share `SHRUNK` of the box, and not at all if it is empty.
     """
     share = cut_out(cut, at, half)
     if 0.0 < share < SHRUNK:

@@ -84,7 +84,10 @@ def _needs_sight(problem: Problem) -> str:
 
 
 def _needs_bearings(problem: Problem) -> str:
-    """Return the missing input, as of `Formulation.needs`, without complete bearings of two stations; else ""."""
+    """Return the missing input as text, as of `Formulation.needs`; "" if two lines of sight are measured.
+
+    A line of sight is an azimuth, in space with an elevation, of one station at one epoch.
+    """
     wanted = ("azimuth", "elevation")[: problem.dimension - 1]
     seen = [
         {

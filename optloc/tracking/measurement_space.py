@@ -171,8 +171,9 @@ def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
 def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok: Array) -> Track:
     """Return the track of fitted values (..., k, q, m) with covariance `cov` (..., k, q, m, q, m).
 
-    Here k counts only the epochs that can have a polynomial: the first `order` epochs are omitted. `ok` (..., k)
-    marks epochs with a polynomial. `apart` is the run with a separate problem for each epoch.
+    Here k counts only the epochs that can have a polynomial: epochs without enough predecessors are omitted. The q
+    derivatives are the value and its rates. The state is the position and, with a rate, the velocity. `ok` (..., k)
+    marks epochs with a polynomial. `apart` is the run of stations that stay, with a separate problem for each epoch.
     """
     d, m, batch = problem.dimension, apart.count, fitted.shape[:-2]
     n = fitted.shape[-2] * d

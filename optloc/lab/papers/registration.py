@@ -153,11 +153,12 @@ def problem(
     epochs : int
         Number of epochs K.
     sigma : float, optional
-        Standard deviation of an arrival, metres; the scene's value by default.
+        The sigma in the formula of `shape`, metres: with "full", the standard deviation of an arrival. By default the
+        value of the scene.
     station_sigma : float
         Standard deviation of each coordinate of a station, drawn at each epoch, metres; 0 for exact stations.
     gain_sigma : float, optional
-        Standard deviation of a gain ratio; None: time differences only.
+        The sigma of gain ratios in the formula of `shape`, without a unit; None: time differences only.
     prior : float, optional
         Prior standard deviation of the biases of the range differences, metres; None: unknown.
     shape : "full", "half" or "diag"

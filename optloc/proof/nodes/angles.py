@@ -353,11 +353,12 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
 
 @compiled
 def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
-    """Return bounds of the change of u when it turns towards v, changes further by `more`, and the range changes.
+    """Return bounds of the absolute change, in each component, of a vector u that is divided by the range.
 
-    All triples are components along the search coordinates. If the tangent of an angle is at most `tangent`, ``u cos +
-    v sin - u`` is at most ``tangent^2/2 |u| + tangent |v|``. With r' the range elsewhere in the box, `near` bounds r/r'
-    and `stretch` bounds its difference from 1.
+    Over the box u turns towards v and changes further by at most `more`. All triples are components along the search
+    coordinates. If the tangent of an angle is at most `tangent`, ``u cos + v sin - u`` is at most ``tangent^2/2 |u| +
+    tangent |v|``. With r the range at the centre and r' the range elsewhere in the box, `near` bounds r/r' and
+    `stretch` bounds its difference from 1.
     """
     bent = 0.5 * tangent * tangent
     return (

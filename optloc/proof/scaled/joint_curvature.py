@@ -343,10 +343,11 @@ def is_convex_scaled(scaled: Scaled, margin: float, box: Box, sheet: ScaledWorks
 
 @compiled
 def clip_stationary(scaled: Scaled, box: Box, sheet: ScaledWorkspace) -> bool:
-    """Contract a box to where a minimum with a short residual may be; return False if no part remains.
+    """Write to `box.cut` the part of a box in which the cost may have a minimum; return False if no part remains.
 
-    Interval Newton in the offsets, as in `optloc.proof.curvature.contract_to_minima`. At a stationary point, the
-    entries of the Hessian's change in the rows of the factors bound the factors' coordinates.
+    Interval Newton in the offsets, as in `optloc.proof.curvature.contract_to_minima`; without a finite bound of the
+    Hessian's change, the whole box remains. `sheet.cross` bounds the changes of the Hessian's entries that belong to
+    the factors. At a stationary point, half of these changes times `sheet.reach` limit the coordinate of each factor.
     """
     reset_cut(box.half, box.cut)
     ball = sum_scaled(scaled, True, box, sheet)

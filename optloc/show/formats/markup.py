@@ -255,7 +255,10 @@ def _gpx_point(
 
 
 def _add_extensions(point: Element, mark: Mark) -> None:
-    """Add status and covariance as an extension, which the schema requires last."""
+    """Add the status to a GPX point, and the covariance along east, north and up, m^2, if it is valid.
+
+    The schema requires extensions as the last child of a point.
+    """
     extensions = _add(point, "extensions")
     _add(extensions, "optloc:status", mark.status)
     if mark.covers:
