@@ -41,8 +41,8 @@ class Scene:
 
         c(T) = min_x chi2(T, x) + ln|2 pi R_T| - sum_T 2 ln(pd / density) - (m - |T|) 2 ln(1 - pd) + penalty.
 
-    R_T is the covariance of the values of T, and ``|T|`` their number. pd is the probability of detection, and density the
-    mean number of false rows per unit of the measurement.
+    R_T is the covariance of the values of T, and ``|T|`` their number. pd is the probability of detection, and density
+    the mean number of false rows per unit of the measurement.
 
     The cost is twice the negative logarithm of the generalised likelihood ratio of Deb et al. (1997), plus a penalty.
     The penalty is the worth of the d most informative rows. A position has d coordinates, and d rows always fit it, so
