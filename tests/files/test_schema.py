@@ -3,7 +3,8 @@
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.schema import ProblemFile, Units, document_of, join, schema, validate
+from optloc.files.schema import ProblemFile, document_of, schema, validate
+from optloc.files.settings import Units, join
 
 
 def test_an_amount_is_a_number_with_its_unit():
