@@ -19,7 +19,7 @@ from optloc.base.units import UNITS
 from optloc.files.constraint_values import ConstraintValues
 from optloc.linear import constraints
 from optloc.models.surfaces import SURFACES
-from optloc.problem.validation import check_polygon
+from optloc.problem.constraint_checks import check_polygon
 
 Made = Sequence[Constraint] | tuple[Motion, Sequence[Constraint]]
 """Constraints; a height along a course also determines the motion that can keep it."""

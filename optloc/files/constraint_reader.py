@@ -19,7 +19,8 @@ from optloc.files.constraint_table import ConstraintTable, constraint_table
 from optloc.files.constraint_values import ConstraintValues
 from optloc.files.schema import ProblemFile
 from optloc.files.settings import join
-from optloc.problem.validation import bands_by_quantity
+from optloc.linear.constraints import for_target
+from optloc.problem.constraint_checks import bands_by_quantity
 
 Demand = StatedConstraint | Sequence[Constraint]
 """A table with the contents of its file, or finished constraints."""
@@ -141,13 +142,8 @@ def _made(kind: ConstraintKind, values: ConstraintValues) -> Any:
 
 def _of_target(constraint: Constraint, target: int, suffix: str) -> Constraint:
     """Return a constraint with the number of its target, and with an ending of its name."""
-    if isinstance(constraint, AnyOf):
-        members = tuple(
-            tuple(replace(band, target=target, name=band.name + suffix) for band in member)
-            for member in constraint.members
-        )
-        return replace(constraint, members=members, target=target, name=constraint.name + suffix)
-    return replace(constraint, target=target, name=constraint.name + suffix)
+    moved = for_target(constraint, target)
+    return replace(moved, name=constraint.name + suffix)
 
 
 def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[str], where: str) -> list[int]:
@@ -189,4 +185,4 @@ def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)
     yield from {(c.target, c.outside, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()
-    yield from (c for c in constraints if not isinstance(c, Band | Polygon))
+    yield from {(c.target, str(c.members)): c for c in constraints if isinstance(c, AnyOf)}.values()

@@ -50,8 +50,8 @@ class ConstraintTable(FileTable):
     within: Amount | None = None
     """Half width of a band around `exactly`."""
     along: bool | None = None
-    """Whether the limit of a moving target holds at all times, or only at the reference time. Heights and separations hold
-    at all times by default; a target with a height along its course follows the Earth."""
+    """Whether the limit of a moving target holds at all times, or only at the reference time. By default, heights and
+    separations hold at all times; a target with a height along its course follows the Earth."""
     min: Amount | list[Bound] | None = None
     """Least value; least coordinates of a box in the frame, -inf for no bound."""
     max: Amount | list[Bound] | None = None

@@ -184,7 +184,10 @@ class ConstraintValues:
         return np.asarray(found[:, :dimension])
 
     def direction(self, key: str = "normal") -> Array:
-        """Return the direction (2 or 3,) under a key: a list of numbers without a unit, at most d."""
+        """Return the direction (d,) under a key: a list of numbers without a unit.
+
+        In space, two numbers are a direction of the plan.
+        """
         value = self.given[key]
         if not isinstance(value, list) or not _PLAN <= len(value) <= self.dimension:
             count = f"{len(value)} coordinates" if isinstance(value, list) else "one number"
@@ -195,4 +198,4 @@ class ConstraintValues:
         found = np.array(value, dtype=float)
         if not found.any():
             raise InvalidProblem(f"{key} is zero", self.place(key), "give a direction, such as [1.0, 0.0]")
-        return found
+        return np.append(found, np.zeros(self.dimension - len(found)))
