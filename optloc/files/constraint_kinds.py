@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest, no_station
 from optloc.base.types import Array, Constraint, Motion
-from optloc.base.units import UNITS
+from optloc.base.units import UNITS, Quantity
 from optloc.files.constraint_values import ConstraintValues
 from optloc.linear import constraints
 from optloc.models.surfaces import SURFACES
@@ -373,7 +373,7 @@ def _quantity(v: ConstraintValues) -> Made:
         what = f"{v.kind} has {len(given)} coefficients, not {wanted}"
         raise InvalidProblem(what, v.place("coefficients"), "give SI numbers, in the order of the quantity")
     # Bounds in units need a quantity whose SI unit optloc knows; bounds of other quantities are plain numbers.
-    quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
+    quantity: Quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
     lower, upper = v.bounds(quantity)
     return constraints.quantity(v.kind, lower, upper, np.array(given, dtype=float), **v.naming)
 

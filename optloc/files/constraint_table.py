@@ -37,7 +37,7 @@ class ConstraintTable(FileTable):
 
     model_config = ConfigDict(json_schema_extra=_conditions)
 
-    kind: str = Field(json_schema_extra=lambda schema: schema.update(enum=kind_names()))
+    kind: str = Field(json_schema_extra=lambda schema: schema.update(enum=[*kind_names()]))
     """Kind of the constraint; each kind has different keys."""
     target: str | None = None
     """Name of the target; by default all targets."""
@@ -150,6 +150,8 @@ def constraint_of_text(text: str, where: str) -> ConstraintTable:
     ends = [*(key.start() for key in keys[1:]), len(rest)][: len(keys)]
     values: dict[str, Any] = {"kind": first}
     for key, end in zip(keys, ends, strict=True):
+        if key[1] in values:
+            raise InvalidProblem(f"the key {key[1]!r} is given twice", where, "remove one of them")
         values[key[1]] = _value(rest[key.end() : end].strip())
     return constraint_table(values, where)
 

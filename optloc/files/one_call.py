@@ -333,8 +333,8 @@ def _problem_of(
         made = _rows(word, found, sigma_si, step, places, speed)
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
         rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
-    found, motions = _constraints(height, limits, places, given, speed)
-    problem = assemble(places.stations, *rows, frame=places.frame, constraints=found, motions=motions, medium=medium)
+    stated, motions = _constraints(height, limits, places, given, speed)
+    problem = assemble(places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, medium=medium)
     return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels
 
 

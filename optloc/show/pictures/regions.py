@@ -72,9 +72,10 @@ def _boxes(problem: Problem) -> tuple[list[DrawnRegion], list[Constraint]]:
     # A box is stored as bounds of single coordinates.
     sides: dict[int, dict[int, Band]] = {}
     for c in problem.constraints:
-        along = np.flatnonzero(c.coefficients) if isinstance(c, Band) and c.kind == "plane" else ()
-        if isinstance(c, Band) and len(along) == 1 and c.coefficients[along[0]] == 1.0 and not np.ndim(c.lower):
-            sides.setdefault(c.target, {})[int(along[0])] = c
+        if isinstance(c, Band) and c.kind == "plane" and not np.ndim(c.lower):
+            along = np.flatnonzero(c.coefficients)
+            if len(along) == 1 and c.coefficients[along[0]] == 1.0:
+                sides.setdefault(c.target, {})[int(along[0])] = c
     boxes, drawn = [], set()
     for bands in sides.values():
         bounds = [(float(bands[i].lower), float(bands[i].upper)) for i in (0, 1) if i in bands]
