@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Array, Band, Bias, CompassRows, Fence, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium
@@ -47,9 +47,11 @@ class Problem:
     frame : Frame
         Coordinate frame.
     constraints : tuple of Band or Polygon
-        Conditions that the answer must meet.
+        Conditions that the answer must meet. A `Fence` among them becomes a member of `fences`.
     medium : Layers or Atmosphere, optional
         Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
+    fences : tuple of Fence
+        Uncertain half-planes, which are terms of the cost.
     """
 
     stations: Stations
@@ -62,6 +64,15 @@ class Problem:
     frame: Frame = CARTESIAN
     constraints: tuple[Band | Polygon, ...] = ()
     medium: Medium | None = None
+    fences: tuple[Fence, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Move fences from the constraints to `fences`: users state both in one list."""
+        stated = tuple(c for c in self.constraints if isinstance(c, Fence))
+        if stated:
+            kept = tuple(c for c in self.constraints if not isinstance(c, Fence))
+            object.__setattr__(self, "constraints", kept)
+            object.__setattr__(self, "fences", (*self.fences, *stated))
 
     @property
     def dimension(self) -> int:
@@ -169,8 +180,20 @@ class Problem:
         # contain.
         bands = [c for c in self.constraints if isinstance(c, Band)]
         constraints = tuple((c.kind, c.target, *_band_key(c, self.motions[c.target])) for c in bands)
-        medium = () if self.medium is None else (self.medium,)
-        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
+        medium: tuple[Any, ...] = () if self.medium is None else (self.medium,)
+        fences = (("fences", *(fence.target for fence in self.fences)),) if self.fences else ()
+        return (
+            rows,
+            blocks,
+            motions,
+            biases,
+            stations,
+            self.times.tobytes(),
+            self.frame,
+            constraints,
+            *medium,
+            *fences,
+        )
 
     def in_medium(self, medium: Medium) -> Problem:
         """Return the problem with its rows measured along the rays of a medium. All positions stay.
@@ -323,6 +346,7 @@ _NUMBERS: dict[type, dict[str, int]] = {
     Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},
     Band: {"lower": 0, "upper": 0, "coefficients": 1},
+    Fence: {"normal": 1, "offset": 0, "sigma": 0},
     Polygon: {},
 }
 
@@ -336,7 +360,8 @@ def _numbers(part: Any) -> list[tuple[str, Array, int]]:
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     """Return each numeric array of a problem, with its rank without batch axes."""
     blocks = problem.noise.blocks
-    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *problem.constraints)
+    stated = (*problem.motions, *problem.priors, *problem.constraints, *problem.fences)
+    parts = (problem.stations, *problem.rows, *blocks, *stated)
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
@@ -362,6 +387,7 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
         motions=each(problem.motions),
         priors=each(problem.priors),
         constraints=each(problem.constraints),
+        fences=each(problem.fences),
     )
 
 

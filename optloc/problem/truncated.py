@@ -191,6 +191,11 @@ class Truncated:
         away = (points - self.shift) @ rays.whitener.T
         return points, (away**2).sum(-1) - (rays.middle**2).sum()
 
+    def nodes(self) -> tuple[Array, Array]:
+        """Return fixed points (p, d) of one distribution, metres from the fix, and their weights (p,), not normalised."""
+        points, weight = self._rays().spread()
+        return points.reshape(-1, points.shape[-1]), weight.ravel()
+
     def outline(self, plane: Array, level: float) -> Array:
         """Return the closed boundary (r, 2) of the highest-density region in a plane, metres from the fix.
 

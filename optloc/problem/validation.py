@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, check_once, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Array, Band, Bias, Fence, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
@@ -89,9 +89,8 @@ def _check_stations(problem: Problem) -> None:
         name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
         raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
     if len(stations.names) != stations.count:
-        raise InvalidProblem(
-            f"{stations.count} stations have {len(stations.names)} names", "stations", "give one name each"
-        )
+        what = f"{stations.count} stations have {len(stations.names)} names"
+        raise InvalidProblem(what, "stations", "give one name each")
     check_once(stations.names, "station name {!r} is used twice", "stations")
     if problem.frame.kind == "ecef" and stations.dimension != 3:
         raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
@@ -294,9 +293,8 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         return
     shape = motion.known.shape
     if len(shape) < 3 or shape[-1] != problem.dimension:
-        raise InvalidProblem(
-            f"the known states have shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
-        )
+        wanted = f"give (epochs or 1, order + 1, {problem.dimension})"
+        raise InvalidProblem(f"the known states have shape {shape}", where, wanted)
     if shape[-3] not in (1, problem.epochs):
         counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
         raise InvalidProblem(
@@ -438,14 +436,16 @@ _SLIVER = 1e-12
 
 def check_constraints(problem: Problem) -> None:
     """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status."""
-    for constraint in problem.constraints:
+    for constraint in (*problem.constraints, *problem.fences):
         where = f"constraint {constraint.name!r}"
         _check_target(problem, constraint, where)
         if isinstance(constraint, Polygon):
             _check_plan(problem, where)
             check_polygon(constraint.vertices, where)
-        else:
+        elif isinstance(constraint, Band):
             _check_band(problem, constraint, where)
+        elif constraint.normal.shape[-1] != problem.dimension:
+            raise InvalidProblem("the normal has another dimension than the stations", where, "match the stations")
     for same in bands_by_quantity(problem.constraints):
         _check_agreement(same)
 
@@ -460,7 +460,7 @@ def bands_by_quantity(constraints: Sequence[Band | Polygon]) -> list[list[Band]]
     return list(groups.values())
 
 
-def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> None:
+def _check_target(problem: Problem, constraint: Band | Polygon | Fence, where: str) -> None:
     """Raise if the target of a constraint is missing or known, or if other unknowns connect its free epochs."""
     count = len(problem.motions)
     if not 0 <= constraint.target < count:

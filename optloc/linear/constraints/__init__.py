@@ -1,0 +1,37 @@
+"""Constraints and fences: functions for users to state them, and the faces on which an estimate may be."""
+
+from optloc.linear.constraints.chance import chance as chance
+from optloc.linear.constraints.faces import (
+    TOLERANCE as TOLERANCE,
+    Face as Face,
+    Level as Level,
+    bounded as bounded,
+    bounds as bounds,
+    box as box,
+    conjunction as conjunction,
+    decisive_epochs as decisive_epochs,
+    exact as exact,
+    face_names as face_names,
+    face_of as face_of,
+    faces as faces,
+    height as height,
+    holds_along as holds_along,
+    is_corner as is_corner,
+    is_exact as is_exact,
+    is_flat as is_flat,
+    is_height as is_height,
+    is_held as is_held,
+    levels as levels,
+    needs_velocity as needs_velocity,
+    on_face as on_face,
+    outwards as outwards,
+    polygon as polygon,
+    reported as reported,
+    restore as restore,
+    speed as speed,
+    tangent_at as tangent_at,
+    violation as violation,
+    violation_names as violation_names,
+    visible as visible,
+)
+from optloc.linear.fences import fence as fence
