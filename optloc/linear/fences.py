@@ -1,7 +1,7 @@
 """Uncertain fences: the knowledge ``n . x <= b + N(0, s^2)`` as a smooth convex term of the cost.
 
-The boundary of the half-plane is at ``b + e``, where e is a normal error. So the probability that the target x is inside
-is ``Phi(u)`` with the margin ``u = (b - n . x) / s``, and the term is ``-2 log Phi(u)``. Phi and phi are the
+The boundary of the half-plane is at ``b + e``, where e is a normal error. So the probability that the target x is
+inside is ``Phi(u)`` with the margin ``u = (b - n . x) / s``, and the term is ``-2 log Phi(u)``. Phi and phi are the
 distribution function and the density of the standard normal distribution; the hazard is ``w = phi(u) / Phi(u)``.
 
 The second derivative ``w (u + w)`` is exact and between 0 and 1, so that the normal equations stay positive definite. A
@@ -32,8 +32,8 @@ from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
 # Coefficients of the Chebyshev series P(2 t - 1) in ``erfc(z) = t exp(P - z^2)`` with ``t = 2 / (2 + z)``, z >= 0. The
-# form is from W. H. Press et al., "Numerical Recipes" (3rd ed., 2007), section 6.2.2. The numbers are projections of the
-# exact function, computed with 50 digits; the next coefficient is below 1e-16.
+# form is from W. H. Press et al., "Numerical Recipes" (3rd ed., 2007), section 6.2.2. The numbers are projections of
+# the exact function, computed with 50 digits; the next coefficient is below 1e-16.
 _CHEBYSHEV = (
     -0.6513268598908547,
     0.64196979235649021,
@@ -118,7 +118,7 @@ def fence(
 def cost_of_margin(u: Any) -> Any:
     """Return ``-2 log Phi(u)`` (...) for margins u (...): arrays of any library, or CasADi symbols.
 
-    The relative error is below 1e-14 for margins from -1e150 to 37; beyond 38 the result is zero.
+    The relative error is below 1e-12 for margins from -1e150 to 37; beyond 38 the result is zero.
     """
     choose, xp = _choose(u), namespace(u)
     # Both branches are evaluated for all margins, and derivatives too: so each has a harmless argument of its own.
@@ -151,7 +151,7 @@ def _choose(u: Any) -> Callable[[Any, Any, Any], Any]:
     if type(u).__module__.startswith("casadi"):
         from casadi import if_else
 
-        return if_else  # type: ignore[no-any-return]  # CasADi has no annotations
+        return if_else
     return library(u).where  # type: ignore[no-any-return]
 
 
@@ -202,10 +202,10 @@ def fence_terms(problem: Problem, x: Any) -> Iterator[FenceTerm]:
     """Yield the fences of a problem as functions of positions, in the library of the vectors x (..., size)."""
     for one in problem.fences:
         name = slot_name(problem, one)
-        arrays = (one.normal, 1), (one.offset, 0), (one.sigma, 0)
+        normal, offset, sigma = one.normal, one.offset, one.sigma
         if not problem.layout.shares(name):
-            arrays = tuple((np.expand_dims(array, array.ndim - core), core) for array, core in arrays)
-        yield FenceTerm(name, *(as_array_like(array, x) for array, _ in arrays))
+            normal, offset, sigma = normal[..., None, :], offset[..., None], sigma[..., None]
+        yield FenceTerm(name, *(as_array_like(array, x) for array in (normal, offset, sigma)))
 
 
 def fence_information(problem: Problem, x: Array) -> Array:

@@ -7,8 +7,9 @@ contains r rows whose noise may be correlated; g groups have the same r.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -523,7 +524,10 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
         Whether to add the priors of shared unknowns, and the priors of local unknowns.
     """
     layout = problem.layout
-    terms = [(name, _prior_term(mean, precision, x)) for name, mean, precision in prior_parts(problem)]
+    terms: list[tuple[str, Any]] = [
+        (name, partial(_gaussian, as_array_like(mean, x), as_array_like(precision, x)))
+        for name, mean, precision in prior_parts(problem)
+    ]
     terms += [(fence.name, fence) for fence in fence_terms(problem, x)]
     if local and walks(problem):
         equations = _with_walks(problem, x, equations)
@@ -536,10 +540,9 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
             continue
         width = layout.n_shared if is_shared else layout.n_local
         # A product with columns of the unit matrix places a block: some libraries cannot write into an array.
-        pick = as_array_like(np.eye(width)[:, slot.start : slot.start + slot.size], x)
-        precision, pull, penalty = term(
-            (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
-        )
+        part = slice(slot.start, slot.start + slot.size)
+        pick = as_array_like(np.eye(width)[:, part], x)
+        precision, pull, penalty = term((at_shared if is_shared else at_local)[..., part])
         block, right = pick @ precision @ pick.mT, (pick @ pull[..., None])[..., 0]
         if is_shared:
             matrix, vector, cost = matrix + block, vector + right, cost + penalty
@@ -549,18 +552,10 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     return Normal(matrix, blocks, equations.cross, vector, local_vector, cost, equations.link)
 
 
-def _prior_term(mean: Array, precision: Array, x: Array) -> Callable[[Any], tuple[Any, Any, Any]]:
-    """Return the function of an unknown (..., q) that gives precision, pull (..., q) and penalty (...) of its prior.
-
-    `x` (..., size) determines the library of the numbers.
-    """
-    precision, mean = as_array_like(precision, x), as_array_like(mean, x)
-
-    def term(value: Any) -> tuple[Any, Any, Any]:
-        pull = (precision @ (mean - value)[..., None])[..., 0]
-        return precision, pull, library(x).sum((mean - value) * pull, axis=-1)
-
-    return term
+def _gaussian(mean: Any, precision: Any, value: Any) -> tuple[Any, Any, Any]:
+    """Return precision, pull (..., q) and penalty (...) of a Gaussian prior at values (..., q) of its unknown."""
+    pull = (precision @ (mean - value)[..., None])[..., 0]
+    return precision, pull, library(value).sum((mean - value) * pull, axis=-1)
 
 
 def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:

@@ -68,9 +68,10 @@ class Problem:
 
     def __post_init__(self) -> None:
         """Move fences from the constraints to `fences`: users state both in one list."""
-        stated = tuple(c for c in self.constraints if isinstance(c, Fence))
+        given: tuple[Any, ...] = self.constraints
+        stated = tuple(c for c in given if isinstance(c, Fence))
         if stated:
-            kept = tuple(c for c in self.constraints if not isinstance(c, Fence))
+            kept = tuple(c for c in given if not isinstance(c, Fence))
             object.__setattr__(self, "constraints", kept)
             object.__setattr__(self, "fences", (*self.fences, *stated))
 

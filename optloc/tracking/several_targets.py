@@ -269,6 +269,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         times=(problem.times if times is None else times)[epochs],
         motions=(Motion(span="epoch"),),
         constraints=tuple(replace(c, target=0) for c in problem.constraints if c.target in target),
+        fences=tuple(replace(c, target=0) for c in problem.fences if c.target in target),
     )
 
 

@@ -30,7 +30,7 @@ def chance(fix: Fix, region: Any) -> Array:
     so it does not change the fix. To impose it, give it to `optloc.assemble`.
 
     One half-plane or slab has a closed form if the law is a Gaussian in metres. All other probabilities are integrated
-    over fixed points: their error is below 0.002, and they are rounded to four decimals.
+    over fixed points: their error is below 0.001, and they are rounded to four decimals.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def _chance(fix: Fix, i: tuple[int, ...], frame: Problem, position: Array, covar
         points, weight = _gaussian(np.zeros_like(position), chart.spread).nodes()
         places = chart.to_position(chart.mean + points)
         # points behind the centre have no position, and are not in the region
-        known = np.isfinite(places).all(-1)
+        known = np.asarray(np.isfinite(places).all(-1))
         return _share(frame, np.where(known[:, None], places, position), weight, known)
     law, skew = chart.truncated, chart.skew
     if law is not None and bool(chart.cut_off):
