@@ -75,9 +75,11 @@ class ConstraintTable(FileTable):
     outer: Amount | None = None
     """Outer radius of an annulus."""
     normal: list[float] | None = None
-    """Direction across a half-plane or a band, of any length."""
+    """Direction across a half-plane, a band or a fence, of any length."""
     offset: Amount | None = None
-    """Greatest value of normal . position for a normal of any length, such as "2 km"."""
+    """Greatest value of normal . position, such as "2 km" for a normal of length one."""
+    sigma: Amount | None = None
+    """Standard deviation of the place of a fence."""
     normals: Points | None = Field(default=None, max_length=_MOST)
     """Outward normals of a polyhedron."""
     offsets: list[float] | None = Field(default=None, max_length=_MOST)

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Constraint, Motion, Stations
+from optloc.base.types import Amount, Array, Band, Motion, Stations
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
-from optloc.files.constraint_reader import StatedConstraints, constraints_of, stated_arguments
+from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
 from optloc.files.propagation import is_time
 from optloc.files.roles import with_standard_columns
@@ -398,7 +398,7 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
 
 def _constraints(
     height: Any, limits: StatedConstraints, places: _Receivers, given: Mapping[str, Any], speed: float
-) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
     """Return the constraints of the target, and its motion.
 
     `height` and `limits` are the arguments `height` and `constraints` of `locate`. `given` has the measurements by
@@ -409,7 +409,7 @@ def _constraints(
     if not demands:
         return _heights(height, places, given), still
 
-    def found(more: dict[str, Any]) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+    def found(more: dict[str, Any]) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
         """Return the stated constraints together with `more`."""
         return constraints_of(demands | more, places.stations, places.frame, still, ("target",), np.zeros(1), speed)
 

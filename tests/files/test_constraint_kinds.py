@@ -78,6 +78,12 @@ CASES = {
         constraints.half_plane([3, 4, 0], 11e3),
         {},
     ),
+    "fence": (
+        'normal = [3.0, 4.0]\noffset = "11 km"\nsigma = 0.1\nunit = "km"',
+        "normal=3,4 offset=11 km sigma=100 m",
+        constraints.fence([3, 4, 0], 11e3, 100.0),
+        {},
+    ),
     "band": (
         'normal = [1.0, 1.0]\nmin = 3.0\nmax = "3500 m"\nunit = "km"',
         "normal=1,1 min=3 km max=3500 m",
@@ -172,10 +178,11 @@ def test_file_option_and_python_state_the_same(kind, tmp_path):
     path.write_text(document(**settings), encoding="utf-8")
     table = constraint_of_text(f"{kind} {option}", "--constraint")
     from_option = read(path, more={"--constraint": table}).problem
-    assert len(from_file.constraints) == len(from_option.constraints) > 0
-    assert all(same(a, b) for a, b in zip(from_file.constraints, from_option.constraints, strict=True))
+    one, two = ((*each.constraints, *each.fences) for each in (from_file, from_option))
+    assert len(one) == len(two) > 0
+    assert all(same(a, b) for a, b in zip(one, two, strict=True))
     if wanted is not None:
-        assert all(same(a, b) for a, b in zip(from_file.constraints, wanted, strict=True))
+        assert all(same(a, b) for a, b in zip(one, wanted, strict=True))
 
 
 QUICK = ("disc", "keep-out-disc", "half-plane", "speed")
@@ -191,7 +198,7 @@ def test_file_and_python_give_the_same_fix(kind, tmp_path):
     assert np.isfinite(found.position).all()
     assert float(violation(from_file, found.x[None])[0]) < 1e-6
     if wanted is not None:
-        other = solve(dataclasses.replace(from_file, constraints=tuple(wanted)), "gtrs+lsr")
+        other = solve(dataclasses.replace(from_file, constraints=tuple(wanted), fences=()), "gtrs+lsr")
         np.testing.assert_allclose(found.position, other.position, atol=1e-6)
         assert found.status == other.status
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Polygon
 from optloc.models.primitives import Point
 from optloc.models.surfaces import SURFACES
 from optloc.problem.problem import Problem
@@ -64,7 +64,8 @@ def drawn_regions(problem: Problem, reach: Array, place: Array) -> tuple[DrawnRe
     centre = (reach.min(0) + reach.max(0)) / 2.0
     boxes, rest = _boxes(problem)
     plan = _Plan(centre, scale, place)
-    return (*boxes, *(shape for constraint in rest for shape in plan.shapes(constraint)))
+    shapes = (shape for constraint in rest for shape in plan.shapes(constraint))
+    return (*boxes, *shapes, *(shape for fence in problem.fences for shape in plan.fence(fence)))
 
 
 def _boxes(problem: Problem) -> tuple[list[DrawnRegion], list[Constraint]]:
@@ -119,6 +120,17 @@ class _Plan:
                     yield from self.shapes(band)
         elif np.ndim(c.lower) == np.ndim(c.upper) == 0 and c.other is None:
             yield from self._of_band(c)
+
+    def fence(self, fence: Fence) -> Iterator[DrawnRegion]:
+        """Yield the stated line of a fence, and the lines one standard deviation beside it."""
+        if np.ndim(fence.offset):
+            return
+        place, sigma = float(fence.offset), float(fence.sigma)
+        line = self._line(fence.normal, place, -1.0)
+        beside = [each for more in (-sigma, sigma) for each in self._line(fence.normal, place + more, -1.0)]
+        if line:
+            yield DrawnRegion("limit", tuple(line), "fence, ticks on the improbable side")
+            yield DrawnRegion("inside", tuple(beside), "fence, one standard deviation")
 
     def _of_band(self, band: Band) -> Iterator[DrawnRegion]:
         """Yield the shapes of a band with one pair of bounds."""
