@@ -14,6 +14,10 @@ from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
+from optloc.solvers.posing.programs import pose_program
+from optloc.solvers.posing.squared_ranges import pose_hull, pose_shor
+from optloc.solvers.posing.statement import ConicStatement, Locate
+from optloc.solvers.scaled_program import ScaledProblem
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.doppler import doppler_starts, has_doppler_of_rest
 from optloc.solvers.starts.position import height_starts, is_registration_run, over_ground, squared_range_starts
@@ -63,6 +67,8 @@ class Formulation:
     bound: Callable[[Problem, Fix], Reference] | None = None
     words: tuple[str, ...] = ()
     needs: Callable[[Problem], str] = lambda problem: ""
+    pose: Callable[[Problem, Locate], ConicStatement | ScaledProblem] | None = None
+    twin: str = ""
 
 
 def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
@@ -128,6 +134,7 @@ _PROGRAMS: dict[str, Formulation] = {
             "gtrs": partial(squared_range_starts, pick=minimum),
             "roots": partial(squared_range_starts, pick=stationary_points),
         },
+        twin="squared_range_conic: shor",
     ),
     "squared_range_conic: shor": Formulation(
         "semidefinite twin of the same problem",
@@ -136,6 +143,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.5 ms",
         "Shor 1987",
         starts={"sdp": partial(squared_range_starts, pick=shor)},
+        pose=pose_shor,
     ),
     "squared_range_conic: hull": Formulation(
         "second-order cone relaxation |x| <= r of the same problem",
@@ -144,6 +152,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.2 ms",
         "convex hull of the cone",
         starts={"socp": partial(squared_range_starts, pick=hull)},
+        pose=pose_hull,
     ),
     "sparse_errors": Formulation(
         "linear rows with a few gross errors, whose sizes are penalised, on the cones of the ranges",
@@ -274,6 +283,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "2 ms",
         "Waechter, Biegler 2006",
         words=("nlp",),
+        pose=pose_program,
     ),
 }
 
