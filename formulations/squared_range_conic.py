@@ -9,7 +9,7 @@ does not grow with the rows):
 the optimum equals the GTRS value and a rank-one optimum exists.
 
 *Second order.* The constraint is relaxed to its convex hull, :math:`|x| \le r` (cone) or :math:`|x|^2 \le w`
-(paraboloid): :math:`\min |R (y, 1)|`. A lower bound, tight when the unconstrained fit violates the hull.
+(paraboloid): :math:`\min |R (y, 1)|^2`. A lower bound, tight when the unconstrained fit violates the hull.
 
 Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); J. J. More,
 "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993); for tightness of the second-order form
@@ -26,6 +26,7 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.squared_range import Quadric
+from formulations.unit_scale import RowScale
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +41,14 @@ class Relaxed:
         Two points of the quadric whose mixture is the solution; NaN if the relaxation is tight, or a point is at
         infinity.
     value : float
-        Optimal ``|By - g|^2`` of the relaxation (the second-order one squared).
+        Optimal ``|By - g|^2`` of the relaxation.
     bound : float
         Lower bound of the squared-range cost, recomputed from the dual.
     rank_ratio : float
         Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order).
         Near zero means tight.
     answer : ConicAnswer
-        The solver's report.
+        The solver's report, in the coordinates of `formulations.unit_scale.RowScale`.
     """
 
     y: Array
@@ -110,7 +111,8 @@ def hull_problem(quadric: Quadric) -> Any:
     factor = cp.Parameter((n + 1, n + 1), name="factor")
     y = cp.Variable(n, name="y")
     inside = cp.norm(y[:-1]) <= y[-1] if quadric.shape == "cone" else cp.sum_squares(y[:-1]) <= y[-1]
-    return cp.Problem(cp.Minimize(cp.norm(factor[:, :n] @ y + factor[:, n])), [inside])
+    # squared: a multiplier is then cost per unit of its constraint, and the residuals of the solver are small
+    return cp.Problem(cp.Minimize(cp.sum_squares(factor[:, :n] @ y + factor[:, n])), [inside])
 
 
 @keep
@@ -128,7 +130,7 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Parameters
     ----------
     B : Array, shape (q, n)
-        Whitened rows, numbers of order one.
+        Whitened rows, in any unit of length.
     g : Array, shape (q,)
         Right sides.
     quadric : Quadric
@@ -148,11 +150,13 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Shor (1987).
     """
     n = quadric.size
-    factor, scale = _triangle(B, g)
+    own = RowScale.of(B, g, quadric)
+    factor, scale = _triangle(*own.rows(B, g))
     answer = _relaxation("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
     lift = answer.values["lift"]
-    y, value, low = lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2
-    return Relaxed(y, mixed_points(lift, quadric), value, low, rank_ratio(lift), answer)
+    points = own.back(np.concatenate([lift[None, :n, n], mixed_points(lift, quadric)]))
+    value, low = answer.primal * scale**2, answer.bound * scale**2
+    return Relaxed(points[0], points[1:], value, low, rank_ratio(lift), answer)
 
 
 def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
@@ -161,7 +165,7 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Parameters
     ----------
     B : Array, shape (q, n)
-        Whitened rows, numbers of order one.
+        Whitened rows, in any unit of length.
     g : Array, shape (q,)
         Right sides.
     quadric : Quadric
@@ -178,14 +182,18 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
 
     Notes
     -----
-    Its objective is the norm; value and bound are squared.
+    The convex hull of the half cone and of the paraboloid.
     """
-    factor, scale = _triangle(B, g)
+    own = RowScale.of(B, g, quadric)
+    factor, scale = _triangle(*own.rows(B, g))
     answer = _relaxation("hull", quadric, backend).solve({"factor": factor}, bound=bound)
     y = answer.values["y"]
     off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
-    value, low = answer.primal * scale, max(answer.bound, 0.0) * scale  # not negative, as they are squared below
-    return Relaxed(y, crossings(factor[:, :-1], y, quadric), value**2, low**2, off, answer)
+    # from the point: the objective of a solver has an error relative to the largest row, which may exceed a small cost
+    value = float(np.sum((factor[:, :-1] @ y + factor[:, -1]) ** 2)) * scale**2
+    low = max(answer.bound, 0.0) * scale**2  # a sum of squares is not negative
+    points = own.back(np.concatenate([y[None], crossings(factor[:, :-1], y, quadric)]))
+    return Relaxed(points[0], points[1:], value, low, off, answer)
 
 
 # Second over first eigenvalue of a lift, and distance from the quadric, below which a solution is one point.
