@@ -29,6 +29,8 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
 from formulations.backend import Choice, Ending, SolverError, count, first_sentence, hold_in_forks, record
+from formulations.nonlinear_solvers import nonlinear_report, status_of
+from formulations.solver_report import SolverReport
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
@@ -80,6 +82,8 @@ class Local:
         True if the solver met its tolerances, the point satisfies the constraints and the cost has a gradient there.
     iterations : int
         Interior-point iterations.
+    report : SolverReport
+        The solver's report; only IPOPT and Uno pass on their residuals.
     """
 
     x: Array
@@ -90,6 +94,7 @@ class Local:
     status: str
     success: bool
     iterations: int
+    report: SolverReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +301,7 @@ class Program:
         try:
             with self.lock:
                 found, stats = self._solver(**given), self._solver.stats()
-            status = str(stats["return_status"])
+            status = status_of(stats)
         except RuntimeError as trouble:  # CasADi raises no other type
             record(Ending(self._name, "error", first_sentence(trouble), found=False))
             raise SolverError(f"{self._name} failed: {trouble}") from trouble
@@ -319,6 +324,7 @@ class Program:
             status=status,
             success=success,
             iterations=iterations,
+            report=nonlinear_report(self._name, stats, status, success=success),
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:

@@ -24,6 +24,7 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.range_height import Ellipsoid, HeightCurve, three_stations
+from formulations.solver_report import SolverReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,8 @@ def lift(
     guess = float(np.linalg.norm(near - stations[0]))
     forms, change = _forms(curve, surface, near, guess)
     if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
-        nothing = ConicAnswer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
+        status = "not formulated"
+        nothing = ConicAnswer({}, np.nan, -np.inf, status, False, 0, SolverReport(backend, status))
         return LiftedHeights(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
     # each form is divided by its largest entry, which an equality allows; the bound is multiplied by it again
     scale = float(np.abs(forms["objective"]).max())

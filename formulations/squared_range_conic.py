@@ -27,6 +27,7 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.squared_range import Quadric
+from formulations.unit_scale import RowScale
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Relaxed:
         Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order).
         Near zero means tight.
     answer : ConicAnswer
-        The solver's report.
+        The solver's report, in the coordinates of `formulations.unit_scale.RowScale`.
     """
 
     y: Array
@@ -122,6 +123,7 @@ def hull_problem(quadric: Quadric, change: Array | None = None) -> Any:
     w = cp.Variable(n, name="y")
     y = w if change is None else change[:, :n] @ w + change[:, n]
     inside = cp.norm(y[:-1]) <= y[-1] if quadric.shape == "cone" else cp.sum_squares(y[:-1]) <= y[-1]
+    # squared: a multiplier is then cost per unit of its constraint, and the residuals of the solver are small
     return cp.Problem(cp.Minimize(cp.sum_squares(factor[:, :n] @ w + factor[:, n])), [inside])
 
 
@@ -146,7 +148,7 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Parameters
     ----------
     B : Array, shape (q, n)
-        Whitened rows, numbers of order one.
+        Whitened rows, in any unit of length.
     g : Array, shape (q,)
         Right sides.
     quadric : Quadric
@@ -166,11 +168,13 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Shor (1987).
     """
     n = quadric.size
-    factor, scale = triangle(B, g)
+    own = RowScale.of(B, g, quadric)
+    factor, scale = triangle(*own.rows(B, g))
     answer = _relaxation("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
     lift = answer.values["lift"]
-    y, value, low = lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2
-    return Relaxed(y, mixed_points(lift, quadric), value, low, rank_ratio(lift), answer)
+    points = own.back(np.concatenate([lift[None, :n, n], mixed_points(lift, quadric)]))
+    value, low = answer.primal * scale**2, answer.bound * scale**2
+    return Relaxed(points[0], points[1:], value, low, rank_ratio(lift), answer)
 
 
 def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
@@ -179,7 +183,7 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Parameters
     ----------
     B : Array, shape (q, n)
-        Whitened rows, numbers of order one.
+        Whitened rows, in any unit of length.
     g : Array, shape (q,)
         Right sides.
     quadric : Quadric
@@ -196,14 +200,18 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
 
     Notes
     -----
-    Its objective is the squared norm.
+    The convex hull of the half cone and of the paraboloid.
     """
-    factor, scale = triangle(B, g)
+    own = RowScale.of(B, g, quadric)
+    factor, scale = triangle(*own.rows(B, g))
     answer = _relaxation("hull", quadric, backend).solve({"factor": factor}, bound=bound)
     y = answer.values["y"]
     off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
-    value, low = answer.primal * scale**2, max(answer.bound, 0.0) * scale**2  # a sum of squares is not negative
-    return Relaxed(y, crossings(factor[:, :-1], y, quadric), value, low, off, answer)
+    # from the point: the objective of a solver has an error relative to the largest row, which may exceed a small cost
+    value = float(np.sum((factor[:, :-1] @ y + factor[:, -1]) ** 2)) * scale**2
+    low = max(answer.bound, 0.0) * scale**2  # a sum of squares is not negative
+    points = own.back(np.concatenate([y[None], crossings(factor[:, :-1], y, quadric)]))
+    return Relaxed(points[0], points[1:], value, low, off, answer)
 
 
 # Second over first eigenvalue of a lift, and distance from the quadric, below which a solution is one point.

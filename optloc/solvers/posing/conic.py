@@ -18,10 +18,6 @@ from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.posed import Posed, Relation
 from optloc.solvers.posing.statement import ConicStatement
 
-# Solvers of cvxpy that use the solution before: first-order methods, which start anywhere.
-_WARM = ("SCS", "OSQP", "COSMO", "CUCLARABEL", "PDLP")
-# Statuses of cvxpy with a solution.
-_SOLVED = ("optimal", "optimal_inaccurate")
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
 # Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
@@ -245,18 +241,22 @@ class PosedConic(Posed):
         refine: bool | None = None,
     ) -> Fix:
         """Return the judged fix of the posed problem; see `Posed.solve`."""
-        from formulations.conic_solvers import solve_problem
+        from formulations.conic_solvers import SOLVERS, solve_problem
 
         name = (solver or "CLARABEL").upper()
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
-        if warm:
-            self._warm(start)
         own = {**(self.statement.settings if name == "CLARABEL" and not self.own_objective else {}), **(settings or {})}
-        report = solve_problem(self._program, name, own, warm=warm and name in _WARM)
-        if warm and name not in _WARM:
-            text = f"{name} is an interior-point or simplex method and does not use start and duals"
+        takes = name in SOLVERS and SOLVERS[name].takes_start
+        try:
+            if warm and takes:
+                self._warm(start)
+            report = solve_problem(self._program, name, own, warm=warm)
+        except ValueError as trouble:
+            raise InvalidProblem(str(trouble), "solver", "see 'optloc list solvers'") from None
+        if warm and not takes:
+            text = f"{name} does not use start and duals, because it is an interior-point or simplex method"
             report = replace(report, message="; ".join(filter(None, [report.message, text])))
-        solved = str(self._program.status) in _SOLVED and self._has_values()
+        solved = report.outcome in ("solved", "inaccurate") and self._has_values()
         answer = self._answer(report, solved)
         if not solved:
             return self._explain_failure(answer)
@@ -314,16 +314,14 @@ class PosedConic(Posed):
         return float(self._size * low + self._constant) if np.isfinite(low) else np.nan
 
     def _explain_failure(self, answer: PosedAnswer) -> Fix:
-        """Return a fix without an answer and its reason, from the status of cvxpy."""
-        status = str(self._program.status)
-        if status.startswith("infeasible") and "unbounded" not in status:
+        """Return a fix without an answer and its reason, from the outcome of the back end."""
+        report = answer.backend
+        if report.outcome == "infeasible":
             return self._failed(Status.INFEASIBLE, f"no point meets the posed problem{self._changes()}", answer)
-        if status.startswith("unbounded"):
+        if report.outcome == "unbounded":
             what = "your objective" if self.own_objective else "the objective"
             return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
-        report = answer.backend
-        detail = getattr(report, "message", "") or getattr(report, "status", status)
-        return self._failed(Status.NUMERICAL, f"{report.backend}: {detail}", answer)
+        return self._failed(Status.NUMERICAL, str(report), answer)
 
 
 def _rows_of(slope: Mapping[Any, Array], one: Any, size: int) -> Array:

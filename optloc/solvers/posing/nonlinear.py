@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from formulations.nls import Local, NonlinearStatement, Program
+from formulations.solver_report import SolverReport
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Band, Status
 from optloc.linear.symbolic import bounds, constrained
@@ -420,10 +421,10 @@ class PosedProgram(Posed):
 
     def _explain_failure(self, found: Local, answer: PosedAnswer) -> Fix:
         """Return a fix without an answer and its reason, from the status of the solver."""
-        status = found.status.lower()
-        if "infeasible" in status or "restoration" in status:
+        status, outcome = found.status.lower(), found.report.outcome
+        if outcome == "infeasible" or "restoration" in status:
             return self._failed(Status.INFEASIBLE, f"no point meets the posed problem{self._changes()}", answer)
-        if "diverging" in status or "unbounded" in status:
+        if outcome == "unbounded" or "diverging" in status:
             what = "your objective" if self.own_objective else "the objective"
             return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
         code = Status.MAX_ITERATIONS if "iteration" in status else Status.NUMERICAL
@@ -432,15 +433,13 @@ class PosedProgram(Posed):
 
 def _report(
     found: Local | None, name: str, message: str, residuals: Callable[[Local], tuple[float, float, float]]
-) -> Any:
-    """Return the report of a local solution, with residuals at its point."""
-    from formulations.solver_report import SolverReport
-
+) -> SolverReport:
+    """Return the solver's report of a local solution, with the residuals at its point, which all solvers lack."""
     if found is None:
-        return SolverReport(name, "error", np.nan, np.nan, np.nan, 0, np.nan, message)
-    own = getattr(found, "report", None)
+        return SolverReport(name, "error", message=message)
     primal, dual, gap = residuals(found)
-    return SolverReport(name, found.status, primal, dual, gap, found.iterations, getattr(own, "seconds", np.nan), message)
+    outcome = "solved" if found.success else found.report.outcome
+    return replace(found.report, primal_residual=primal, dual_residual=dual, gap=gap, outcome=outcome)
 
 
 def _is_length(band: Band) -> bool:
