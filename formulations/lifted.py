@@ -101,8 +101,40 @@ def lifted_problem(count: int, dim: int) -> Any:
 @keep
 def _relaxation(count: int, dim: int, backend: str) -> Relaxation:
     """Return the relaxation for `count` stations in `dim` dimensions, built once for each size and back end."""
-    # a decade below the default of Clarabel, because the value that this baseline demonstrates is near zero
-    return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight(backend, 1e-9))
+    return Relaxation(lifted_problem(count, dim), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation for a back end.
+
+    The tolerance is a decade below the default of Clarabel, because the value that this baseline demonstrates is near
+    zero.
+    """
+    return tight(backend, 1e-9)
+
+
+def lifted_data(
+    rows: ArrayLike, right: ArrayLike, station: ArrayLike, *, reach: float = 10.0
+) -> tuple[dict[str, Array], float, float]:
+    """Return the data of the relaxation; arguments as in `lifted_ranges`.
+
+    Returns
+    -------
+    values : dict of str to Array
+        Parameters of `lifted_problem`.
+    size : float
+        The cost is the square of `size` times the objective.
+    longest : float
+        Greatest length of the lift of any point within the reach.
+    """
+    K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
+    table = np.concatenate([-z[:, None], K], axis=1)
+    size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
+    square = (S * S).sum(axis=1)
+    # |(1, x, r)|^2 of every point within the reach, which makes the bound rigorous
+    longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
+    values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
+    return values, size, longest
 
 
 def lifted_ranges(
@@ -132,16 +164,9 @@ def lifted_ranges(
     -----
     Yang, Wang and Luo (2009). Built once per size and back end in each process.
     """
-    K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
-    count, dim = S.shape
-    table = np.concatenate([-z[:, None], K], axis=1)
-    size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
-    relaxation = _relaxation(count, dim, backend)
-    square = (S * S).sum(axis=1)
-    # |(1, x, r)|^2 of every point within the reach, which makes the bound rigorous
-    longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
-    values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
-    answer = relaxation.solve(values, reach=longest)
+    values, size, longest = lifted_data(rows, right, station, reach=reach)
+    count, dim = values["station"].shape
+    answer = _relaxation(count, dim, backend).solve(values, reach=longest)
     lift = answer.values["lift"]
     point, ranges = lift[0, 1 : 1 + dim].copy(), lift[0, 1 + dim :].copy()
     bound = max(answer.bound, 0.0) * size**2  # a sum of squares is not negative
