@@ -15,7 +15,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Amount, AnyOf, Array, Bias, Constraint, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity
 from optloc.files.schema import (
     BiasTable,
@@ -34,8 +34,8 @@ from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
+from optloc.problem.constraint_checks import bands_by_quantity, check_polygon
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
-from optloc.problem.validation import bands_by_quantity, check_polygon
 
 # Number of estimated derivatives of the position for each motion.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
@@ -58,7 +58,6 @@ _KEYS = {
     "visible": ("stations", "elevation"),
     "speed": ("min", "max", "unit"),
 }
-Constraint = Band | Polygon
 
 
 def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], source: str) -> tuple[Motion, ...]:
@@ -563,10 +562,12 @@ def _visibility(table: ConstraintTable, stations: Stations, frame: Frame, where:
 
 
 def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
-    """Yield the intersection of the bands on each quantity, and each polygon once."""
+    """Yield the intersection of the bands on each quantity, and each polygon and each union once."""
     # Keep two bands that contradict each other: the check of the problem reports them.
     for bands in bands_by_quantity(constraints):
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)
-    yield from {(c.target, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()
+    regions = [c for c in constraints if isinstance(c, Polygon)]
+    yield from {(c.target, c.outside, c.vertices.tobytes()): c for c in regions}.values()
+    yield from {(c.target, str(c.members)): c for c in constraints if isinstance(c, AnyOf)}.values()
