@@ -499,18 +499,20 @@ def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> i
     return _shape((rates.shape[1], dimension), first, second, design, rate, False).places[-1]
 
 
-def doppler_problem(shape: Shape) -> Any:
+def doppler_problem(shape: Shape, change: Array | None = None) -> Any:
     """Build the relaxation as a cvxpy problem.
 
     Parameters
     ----------
     shape : Shape
         Structure of the lift.
+    change : Array, shape (n, n), optional
+        Other unknowns u, whose first is 1, with ``y = change u``; by default u is y.
 
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of shape (n, n), ordered (1, x, beta, r, w); parameters of `DopplerScene.parameters`.
+        Variable ``lift`` of shape (n, n) of u; parameters of `DopplerScene.parameters`, with ``gram`` in u.
 
     Notes
     -----
@@ -520,13 +522,14 @@ def doppler_problem(shape: Shape) -> Any:
 
     d, count = shape.dimension, shape.nodes
     beta, r, w, size = shape.places
-    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    own = cp.Variable((size, size), symmetric=True, name="lift")
+    lift = own if change is None else change @ own @ change.T
     gram = cp.Parameter((size, size), name="gram")
     station, square = cp.Parameter((count, d), name="station"), cp.Parameter(count, name="square")
     x, inside, far = lift[0, 1:beta], lift[1:beta, 1:beta], lift[0, r:w]
     rules = [
-        lift >> 0,
-        lift[0, 0] == 1,
+        own >> 0,
+        own[0, 0] == 1,
         cp.diag(lift)[r:w] == cp.trace(inside) - 2 * station @ x + square,
         far >= 0,
         *(cp.norm(x - station[i]) <= far[i] for i in range(count)),
@@ -543,7 +546,7 @@ def doppler_problem(shape: Shape) -> Any:
         rules += [lift[r + u, r + v] >= dot, lift[r + u, r + v] >= -dot]
     if r > beta:
         rules.append(cp.diag(lift)[beta:r] <= cp.Parameter(r - beta, name="limit"))
-    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, lift))), [*rules, *_products(shape, lift)])
+    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, own))), [*rules, *_products(shape, lift)])
 
 
 def _products(shape: Shape, lift: Any) -> list[Any]:

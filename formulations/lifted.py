@@ -60,19 +60,21 @@ class Lifted:
     answer: ConicAnswer
 
 
-def lifted_problem(count: int, dim: int) -> Any:
+def lifted_problem(count: int, dim: int, change: Array | None = None) -> Any:
     """Build the order-one relaxation as a cvxpy problem: a baseline, never a default.
 
     Parameters
     ----------
     count, dim : int
         M stations in d dimensions.
+    change : Array, shape (1 + d + M, 1 + d + M), optional
+        Other unknowns u, whose first is 1, with ``(1, x, r) = change u``; by default u is (1, x, r).
 
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of shape (1 + d + M, 1 + d + M), ordered (1, x, r); parameters ``gram`` (1 + M, 1 + M), the
-        products of ``[-z, K]``; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
+        Variable ``lift`` of shape (1 + d + M, 1 + d + M) of u; parameters ``gram`` (1 + M, 1 + M), the products of
+        ``[-z, K]`` in these unknowns; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
         largest ``|x|^2``, without which range differences leave the lift unbounded.
 
     Notes
@@ -82,14 +84,15 @@ def lifted_problem(count: int, dim: int) -> Any:
     import cvxpy as cp
 
     size, first = 1 + dim + count, 1 + dim
-    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    own = cp.Variable((size, size), symmetric=True, name="lift")
+    lift = own if change is None else change @ own @ change.T
     gram = cp.Parameter((1 + count, 1 + count), name="gram")
     station, square = cp.Parameter((count, dim), name="station"), cp.Parameter(count, name="square")
     reach = cp.Parameter(name="reach")
     x, r, diagonal = lift[0, 1:first], lift[0, first:], cp.diag(lift)
-    value = gram[0, 0] + 2 * gram[0, 1:] @ r + cp.sum(cp.multiply(gram[1:, 1:], lift[first:, first:]))
+    value = gram[0, 0] + 2 * gram[0, 1:] @ own[0, first:] + cp.sum(cp.multiply(gram[1:, 1:], own[first:, first:]))
     rules = [
-        lift >> 0,
+        own >> 0,
         lift[0, 0] == 1,
         diagonal[first:] == cp.sum(diagonal[1:first]) - 2 * station @ x + square,
         r >= 0,

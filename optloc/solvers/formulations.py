@@ -14,6 +14,7 @@ from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
+from optloc.solvers.posing.gross_errors import pose_sparse
 from optloc.solvers.posing.moving_stations import pose_doppler, pose_registration
 from optloc.solvers.posing.programs import pose_program
 from optloc.solvers.posing.range_moments import pose_heights, pose_lifted, pose_moments
@@ -165,6 +166,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "1 ms",
         "Donoho, Johnstone 1994; Yuan, Lin 2006; She, Owen 2011",
         words=("sparse",),
+        pose=pose_sparse,
     ),
     "range_height": Formulation(
         "ranges with one common unknown, on an ellipsoid: a quartic, with horizon",

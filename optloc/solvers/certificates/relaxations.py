@@ -231,11 +231,14 @@ class EnclosedRanges:
     scope: str
 
 
-def enclosed_ranges(problem: Problem, fix: Fix) -> EnclosedRanges | str:
-    """Return the ranges and the box of a flat batch of one problem, or the reason why there are none."""
+def enclosed_ranges(problem: Problem, fix: Fix, margin: float) -> EnclosedRanges | str:
+    """Return the ranges and the box of a flat batch of one problem, or the reason why there are none.
+
+    The box contains the positions whose chi-square is at most `margin` above that of the fix.
+    """
     why = _beyond(problem) or _beyond_moments(problem)
     found = None if why else ranges(problem_at_rest(problem))
-    return why if found is None else _enclosed(found, _places(problem, found), fix, 0, None)
+    return why if found is None else _enclosed(found, _places(problem, found), fix, 0, None, margin)
 
 
 def _places(problem: Problem, found: Ranges) -> Array:
@@ -244,7 +247,9 @@ def _places(problem: Problem, found: Ranges) -> Array:
     return np.broadcast_to(problem.stations.position, shape)[:, found.epoch, found.station]
 
 
-def _enclosed(found: Ranges, place: Array, fix: Fix, i: int, region: float | None) -> EnclosedRanges | str:
+def _enclosed(
+    found: Ranges, place: Array, fix: Fix, i: int, region: float | None, margin: float = _MARGIN
+) -> EnclosedRanges | str:
     """Return the ranges and the box of problem i, or the reason why there are none; `region` is in metres."""
     why = _declined(found, i, bool(fix.answered[i]))
     if why:
@@ -259,9 +264,9 @@ def _enclosed(found: Ranges, place: Array, fix: Fix, i: int, region: float | Non
     loops = float(fix.cost[i]) - cost
     if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
         return "the cost of the ranges differs from the cost of the fix"
-    box = enclosure(scaled, point, cost + _MARGIN)
+    box = enclosure(scaled, point, cost + margin)
     scope = "global" if box is not None else "region"
-    return EnclosedRanges(scaled, box or _region(scaled, region, size), cost + _MARGIN, loops, centre, size, scope)
+    return EnclosedRanges(scaled, box or _region(scaled, region, size), cost + margin, loops, centre, size, scope)
 
 
 def _declined(found: Ranges, i: int, answered: bool) -> str:

@@ -43,7 +43,9 @@ def pose(problem: Problem, formulation: str) -> Posed:
         twin = entry.twin or "nls"
         raise InvalidProblem(f"{name!r} is a closed form and no optimisation problem", "formulation", f"pose {twin!r}")
     if not entry.serves(one) and entry.starts:
-        raise InvalidProblem(f"{name!r} does not cover this problem: it supports {entry.kinds}", "formulation", "use 'nls'")
+        raise InvalidProblem(
+            f"{name!r} does not cover this problem: it supports {entry.kinds}", "formulation", "use 'nls'"
+        )
     statement = entry.pose(one, lambda part: solve(part).flat())
     if isinstance(statement, ConicStatement):
         return PosedConic(one, name, statement)
@@ -79,7 +81,9 @@ def _named(problem: Problem, text: str) -> str:
     if len(found) == 1:
         return found[0]
     if len(found) > 1:
-        raise InvalidProblem(f"{text!r} stands for several formulations", "formulation", f"use {' or '.join(map(repr, found))}")
+        raise InvalidProblem(
+            f"{text!r} stands for several formulations", "formulation", f"use {' or '.join(map(repr, found))}"
+        )
     parts = [name for name in entries if name.partition(": ")[2] == text]
     if len(parts) == 1:
         return parts[0]

@@ -78,7 +78,9 @@ class PosedConic(Posed):
     def residual(self) -> Any:
         """Return the residuals (m,) of the rows of the formulation as an expression, standard deviations."""
         if self.statement.residual is None:
-            why = self.statement.missing.get("residual", f"{self.formulation!r} fits its rows exactly and has no residual")
+            why = self.statement.missing.get(
+                "residual", f"{self.formulation!r} fits its rows exactly and has no residual"
+            )
             raise InvalidProblem(why, "residual", "use the formulation 'nls'")
         return self.statement.residual
 
@@ -95,7 +97,9 @@ class PosedConic(Posed):
         self._check_unknowns(expression, "objective")
         if not (expression.is_convex() and expression.is_dcp()):
             raise InvalidProblem(
-                "the objective is not convex by cvxpy's rules", "objective", "use the formulation 'nls' or a convex atom"
+                "the objective is not convex by cvxpy's rules",
+                "objective",
+                "use the formulation 'nls' or a convex atom",
             )
         size = float(self._units(expression)[0])
         self._goal, self._size, self._constant, self.own_objective = cp.sum(expression) / size, size, 0.0, True
@@ -158,7 +162,9 @@ class PosedConic(Posed):
             )
         if isinstance(constraint, kinds.SOC | kinds.PSD):
             unit = float(np.max(np.concatenate([self._units(one) for one in constraint.args])))
-            return Relation(name, (type(constraint)(*(one / unit for one in constraint.args)),), (np.array(unit),), True)
+            return Relation(
+                name, (type(constraint)(*(one / unit for one in constraint.args)),), (np.array(unit),), True
+            )
         if isinstance(constraint, kinds.Inequality | kinds.Equality):
             left, equal = constraint.expr, isinstance(constraint, kinds.Equality)
         elif isinstance(constraint, kinds.NonNeg | kinds.NonPos | kinds.Zero):
@@ -281,7 +287,9 @@ class PosedConic(Posed):
         values: dict[str, float | Array] = {}
         for name, one in self.relations.items():
             pairs = list(zip(one.parts, one.divisor, strict=True))
-            duals[name] = _joined([self._size * _dual(part) / unit if solved else np.nan * unit for part, unit in pairs])
+            duals[name] = _joined(
+                [self._size * _dual(part) / unit if solved else np.nan * unit for part, unit in pairs]
+            )
             values[name] = _joined([_value(part) * unit if solved else np.nan * unit for part, unit in pairs])
         value = float(self._size * self._goal.value + self._constant) if solved else np.nan
         return PosedAnswer(
@@ -317,10 +325,13 @@ class PosedConic(Posed):
         """Return a fix without an answer and its reason, from the outcome of the back end."""
         report = answer.backend
         if report.outcome == "infeasible":
-            return self._failed(Status.INFEASIBLE, f"no point meets the posed problem{self._changes()}", answer)
+            text = f"no point meets the posed problem{self._changes()} {self.statement.within}".rstrip()
+            return self._failed(Status.INFEASIBLE, text, answer)
         if report.outcome == "unbounded":
             what = "your objective" if self.own_objective else "the objective"
-            return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
+            return self._failed(
+                Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
+            )
         return self._failed(Status.NUMERICAL, str(report), answer)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band
-from optloc.linear.constraints import conjunction
+from optloc.base.types import Array, Band, Constraint
+from optloc.linear.constraints import conjunction, is_conjunctive
 from optloc.problem.problem import Problem
 
 
@@ -42,17 +41,17 @@ class ConvexBall:
 
 ConvexSet = HalfSpace | ConvexBall
 
-_ONLY = "a relaxation takes half-planes, balls and convex polygons; use the formulation 'nls'"
+_ONLY = "a relaxation takes half-planes, discs, balls and convex polygons; use the formulation 'nls'"
 
 
-def as_convex(problem: Problem, constraint: Any) -> tuple[ConvexSet, ...]:
+def as_convex(problem: Problem, constraint: Constraint) -> tuple[ConvexSet, ...]:
     """Return a constraint of the table as convex sets that the position of its target is in.
 
     Parameters
     ----------
     problem : Problem
         A problem with one target.
-    constraint : Band or Polygon
+    constraint : Band, Polygon or AnyOf
         An element of the constraints of a problem.
 
     Raises
@@ -60,18 +59,18 @@ def as_convex(problem: Problem, constraint: Any) -> tuple[ConvexSet, ...]:
     InvalidProblem
         If the constraint is not convex, or does not bound a position.
     """
-    bands = [constraint] if isinstance(constraint, Band) else conjunction_of(problem, constraint)
-    return tuple(part for band in bands for part in _of_band(problem, band))
+    return tuple(part for band in conjunction_of(problem, constraint) for part in _of_band(problem, band))
 
 
-def conjunction_of(problem: Problem, constraint: Any) -> list[Band]:
+def conjunction_of(problem: Problem, constraint: Constraint) -> list[Band]:
     """Return the bands that state a constraint together; raise InvalidProblem if it is not such a conjunction."""
-    from dataclasses import replace
-
-    bands = conjunction(replace(problem, constraints=(constraint,)))
-    if not bands:
-        raise InvalidProblem(f"the constraint {constraint.name!r} is not convex", "constraint", _ONLY)
-    return bands
+    if not is_conjunctive(constraint):
+        raise InvalidProblem(
+            f"the constraint {constraint.name!r} is a union of regions",
+            "constraint",
+            "state it in the problem and use optloc.solve, which tries every region",
+        )
+    return conjunction(replace(problem, constraints=(constraint,)))
 
 
 def _of_band(problem: Problem, band: Band) -> list[ConvexSet]:
@@ -88,4 +87,6 @@ def _of_band(problem: Problem, band: Band) -> list[ConvexSet]:
             return [HalfSpace(normal, upper, equal=True)]
         sides = [(1.0, upper), (-1.0, -lower)]
         return [HalfSpace(sign * normal, offset) for sign, offset in sides if np.isfinite(offset)]
+    if band.kind == "distance" and not lower > 0.0:
+        return [ConvexBall(np.ravel(band.coefficients).astype(float), upper)]
     raise InvalidProblem(f"the constraint {band.name!r} on the {band.kind} is not convex", "constraint", _ONLY)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from formulations.squared_range_conic import in_deviations
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.vectors import vectors
@@ -26,7 +27,12 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
     The parameter "price" multiplies the mean squared distance from the array's centre, which is part of the objective.
     `locate` is not used.
     """
-    from formulations.registration_sdp import RegistrationWindows, largest_rank_ratio, registration, registration_problem
+    from formulations.registration_sdp import (
+        RegistrationWindows,
+        largest_rank_ratio,
+        registration,
+        registration_problem,
+    )
 
     steady = steady_blocks(problem)
     run = run_of(steady)
@@ -38,7 +44,9 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
             "formulation",
             'use "nls"',
         )
-    data = RegistrationWindows.of(*(given[name] for name in ("station", "z", "whiten", "sigma", "design", "mean", "time")))
+    data = RegistrationWindows.of(
+        *(given[name] for name in ("station", "z", "whiten", "sigma", "design", "mean", "time"))
+    )
     (K, S, d), order, b = data.station.shape, data.power.shape[1] - 1, len(data.prior)
     program = registration_problem(K, S, d, order, b)
     set_parameters(program, {**data.parameters(), "price": answers[0].price * data.weight})
@@ -114,9 +122,11 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
     far, size, answer = last_pass(scene, reach=_REACH)
     if not np.isfinite(answer.primal):
         raise InvalidProblem("the first pass of the relaxation has no solution", "formulation", 'use "nls"')
-    program = doppler_problem(scene.shape)
-    set_parameters(program, scene.parameters(far, _REACH)[0])
-    lift, d = variable(program, "lift"), problem.dimension
+    change, gram, size = _whitened((scene.whiten @ (scene.rows / far[:, None])), size)
+    program = doppler_problem(scene.shape, change)
+    set_parameters(program, {**scene.parameters(far, _REACH)[0], "gram": gram})
+    own, d = variable(program, "lift"), problem.dimension
+    lift = change @ own @ change.T
     position, origin = scene.origin + scene.length * lift[0, 1 : 1 + d], scene.origin
     if surface is not None:
         turn = frame.rotation_to_ecef()
@@ -139,3 +149,19 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
         rank_ratio=lambda: rank_ratio(lift.value),
         settings=settings_of(),
     )
+
+
+def _whitened(form: Array, size: float) -> tuple[Array, Array, float]:
+    """Return a change of unknowns after which residuals are standard deviations, their products, and the unit of these.
+
+    `form` (m, n) are the whitened rows in y, whose first entry is 1. Without the change, a cost of a few standard
+    deviations is rounding beside the squares of the ranges, of which `size` is the unit.
+    """
+    n = form.shape[1]
+    change = np.eye(n)
+    inner = in_deviations(form[:, 1:], -form[:, 0])
+    change[1:, 1:], change[1:, 0] = inner[:, :-1], inner[:, -1]
+    white = form @ change
+    gram = white.T @ white
+    own = float(np.abs(gram).max()) or size
+    return change, gram / own, own

@@ -158,7 +158,9 @@ class PosedProgram(Posed):
         try:
             goal = ca.SX(expression)
         except (NotImplementedError, TypeError, RuntimeError):
-            raise InvalidProblem("the objective is no expression of casadi.SX", "objective", "use posed.residual") from None
+            raise InvalidProblem(
+                "the objective is no expression of casadi.SX", "objective", "use posed.residual"
+            ) from None
         if goal.numel() != 1:
             raise InvalidProblem("the objective is not a scalar expression", "objective", "sum its entries")
         self._check_unknowns(goal, "objective")
@@ -172,7 +174,9 @@ class PosedProgram(Posed):
         symbols = ca.symvar(expression)
         own = {one.element_hash() for one in ca.vertsplit(ca.vertcat(self._base.x, self._base.p))}
         if any(one.element_hash() not in own for one in symbols):
-            raise InvalidProblem("it has a symbol that is not of this problem", where, "use posed.position or posed.of(name)")
+            raise InvalidProblem(
+                "it has a symbol that is not of this problem", where, "use posed.position or posed.of(name)"
+            )
         if not ca.depends_on(expression, self._base.x):
             raise InvalidProblem("it has no unknown of this problem", where, "use posed.position or posed.of(name)")
 
@@ -269,7 +273,10 @@ class PosedProgram(Posed):
         equal, more = ([sign * left for left, is_equal in parts if is_equal is kind] for kind, sign in
                        ((True, 1.0), (False, -1.0)))  # fmt: skip
         self._statement: NonlinearStatement = replace(
-            self._base, f=self._goal, equalities=ca.vertcat(ca.SX(0, 1), *equal), inequalities=ca.vertcat(ca.SX(0, 1), *more)
+            self._base,
+            f=self._goal,
+            equalities=ca.vertcat(ca.SX(0, 1), *equal),
+            inequalities=ca.vertcat(ca.SX(0, 1), *more),
         )
         self.problem = {"x": self._base.x, "f": self._goal, "g": self._statement.g, "p": self._base.p}
 
@@ -298,7 +305,9 @@ class PosedProgram(Posed):
             program = Program.of(self._program, self._statement, choice=choice, settings=own)
         except RuntimeError as trouble:
             text = str(trouble).partition("\n")[0][:200]
-            raise InvalidProblem(f"CasADi cannot use {name!r} with these settings: {text}", "solver", "see optloc list solvers") from None
+            raise InvalidProblem(
+                f"CasADi cannot use {name!r} with these settings: {text}", "solver", "see optloc list solvers"
+            ) from None
         multipliers = None if duals is None or not warm else (np.zeros(program.n), self._multipliers(duals))
         found: list[Local] = []
         trouble_text = ""
@@ -348,7 +357,9 @@ class PosedProgram(Posed):
             slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
             out[slot.start : slot.start + slot.size] = value
             return out
-        raise InvalidProblem(f"start has {len(value)} numbers, not {size}", "start", "give a fix, a vector or a position")
+        raise InvalidProblem(
+            f"start has {len(value)} numbers, not {size}", "start", "give a fix, a vector or a position"
+        )
 
     def _of_answer(self, start: Any) -> Any:
         """Return the vector of an earlier posed answer in SI units; any other start unchanged."""
@@ -363,7 +374,9 @@ class PosedProgram(Posed):
         for name, one in self.relations.items():
             given = np.ravel(duals.get(name, np.zeros(len(one.parts))))
             if len(given) != len(one.parts):
-                raise InvalidProblem(f"{name!r} has {len(one.parts)} duals, not {len(given)}", "duals", "use fix.posed.duals")
+                raise InvalidProblem(
+                    f"{name!r} has {len(one.parts)} duals, not {len(given)}", "duals", "use fix.posed.duals"
+                )
             for (_, equal), unit, dual in zip(one.parts, one.divisor, given, strict=True):
                 (first if equal else second).append(float(dual * unit) * (1.0 if equal else -1.0))
         return np.array([*first, *second])
@@ -390,7 +403,9 @@ class PosedProgram(Posed):
         report = _report(found, name, message, self._residuals)
         cost = np.nan if found is None else found.cost
         variables = {} if found is None else {"x": found.x}
-        return PosedAnswer(self.formulation, duals, values, report, cost, np.nan, np.nan, refined=False, variables=variables)
+        return PosedAnswer(
+            self.formulation, duals, values, report, cost, np.nan, np.nan, refined=False, variables=variables
+        )
 
     def _evaluate(self, y: Array) -> dict[str, Array]:
         """Return the values of the parts of all relations at a scaled vector, in their units."""
@@ -409,7 +424,9 @@ class PosedProgram(Posed):
 
         x, state = self._base.x, self._statement
         rows = ca.Function(
-            "rows", [x, self._base.p], [ca.gradient(state.f, x), ca.jacobian(state.g, x), state.equalities, state.inequalities]
+            "rows",
+            [x, self._base.p],
+            [ca.gradient(state.f, x), ca.jacobian(state.g, x), state.equalities, state.inequalities],
         )
         slope, turn, equal, more = (one.full() for one in rows(found.x, self.parameters))
         multipliers = np.concatenate([found.equalities, found.inequalities])
@@ -426,7 +443,9 @@ class PosedProgram(Posed):
             return self._failed(Status.INFEASIBLE, f"no point meets the posed problem{self._changes()}", answer)
         if outcome == "unbounded" or "diverging" in status:
             what = "your objective" if self.own_objective else "the objective"
-            return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
+            return self._failed(
+                Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
+            )
         code = Status.MAX_ITERATIONS if "iteration" in status else Status.NUMERICAL
         return self._failed(code, f"{answer.backend.backend}: {found.status}", answer)
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band, Polygon, Status
+from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
@@ -173,11 +174,13 @@ class Posed(ABC):
         named = [(one.name if name is None else name, one) for one in members]
         for label in dict.fromkeys(label for label, _ in named):
             self._new_name(label)
+        kept = tuple(one if one.name == label else replace(one, name=label) for label, one in named)
+        stated = replace(self.stated, constraints=(*self.stated.constraints, *kept))
+        check_constraints(stated)
         found: dict[str, list[Relation]] = {}
         for label, one in named:
             found.setdefault(label, []).append(self._table_relation(one, label))
-        kept = tuple(one if one.name == label else replace(one, name=label) for label, one in named)
-        self.stated = replace(self.stated, constraints=(*self.stated.constraints, *kept))
+        self.stated = stated
         for label, several in found.items():
             parts = tuple(part for one in several for part in one.parts)
             self._put(Relation(label, parts, tuple(d for one in several for d in one.divisor), free=False))
@@ -185,7 +188,9 @@ class Posed(ABC):
     def _new_name(self, name: str | None) -> str:
         """Return a name for a constraint; raise InvalidProblem if it is in use."""
         if name is None:
-            name = next(text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations)
+            name = next(
+                text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
+            )
         if name in self.relations:
             raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
         return name
@@ -287,7 +292,9 @@ class Posed(ABC):
 
     def _changes(self) -> str:
         """Return the changes of the posed problem as the end of a sentence."""
-        what = [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
+        what = (
+            [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
+        )
         what += ["your objective"] if self.own_objective else []
         return f" with {' and '.join(what)}" if what else ""
 
@@ -297,17 +304,14 @@ class Posed(ABC):
         return _marked(fix, code, reason, replace(answer, refined=False))
 
 
-def _table_members(constraint: Any) -> list[Any] | None:
+def _table_members(constraint: Any) -> list[Constraint] | None:
     """Return constraints of the table as a list; None for anything else."""
-    if isinstance(constraint, TABLE):
+    kinds = Band | Polygon | AnyOf
+    if isinstance(constraint, kinds):
         return [constraint]
-    if isinstance(constraint, tuple | list) and constraint and all(isinstance(one, TABLE) for one in constraint):
+    if isinstance(constraint, tuple | list) and constraint and all(isinstance(one, kinds) for one in constraint):
         return list(constraint)
     return None
-
-
-TABLE: tuple[type, ...] = (Band, Polygon)
-"""Types of the constraints of the table."""
 
 
 def _quoted(names: Iterable[str]) -> str:

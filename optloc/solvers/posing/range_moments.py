@@ -16,6 +16,10 @@ from optloc.solvers.certificates.relaxations import enclosed_ranges
 from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.position import height_sights, spread_of
 
+# Chi-square above that of the fix up to which positions are in the box of moments: a constraint may move the optimum
+# by four standard deviations. A larger box is less tight.
+_MARGIN = 16.0
+
 
 def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
     """Return the moment relaxation of a flat batch of one problem, in the box of costs as low as that of its fix.
@@ -25,7 +29,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
     from formulations.conic import rank_ratio
     from formulations.moment_sdp import moment_problem, moment_program, moments, settings_of
 
-    about = enclosed_ranges(problem, locate(problem))
+    about = enclosed_ranges(problem, locate(problem), _MARGIN)
     if isinstance(about, str) or about.box is None:
         why = about if isinstance(about, str) else "the rows do not bound the positions with a cost this low"
         raise InvalidProblem(why, "formulation", 'use "nls"')
@@ -55,6 +59,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
             "range": about.size * (middle + half * y[place[0, -1]]),
         },
         residual=data.white @ first,
+        within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above that of the fix",
         read=read,
         rank_ratio=lambda: rank_ratio(y.value[place]),
         settings=settings_of(),
@@ -104,21 +109,29 @@ def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
     """Return the order-1 lift of a flat batch of one problem whose rows are sums of ranges; `locate` is not used."""
     from formulations.conic import rank_ratio
     from formulations.lifted import lifted_data, lifted_problem, settings_of
+    from formulations.squared_range_conic import in_deviations
 
     models = [MODELS[rows.kind] for rows in problem.rows]
     if not one_position(problem) or any(model.ranges is None or model.emission for model in models):
-        raise InvalidProblem("this formulation needs ranges or their differences of one position", "formulation", 'use "nls"')
+        raise InvalidProblem(
+            "this formulation needs ranges or their differences of one position", "formulation", 'use "nls"'
+        )
     centre, spread = spread_of(problem)
     origin, unit = centre[0], float(spread[0])
     alone = problem_at_rest(problem)
     rows, right = range_rows(alone, unit)
     place = np.broadcast_to(alone.stations.position, (1, *alone.stations.position.shape[-3:]))[0, 0]
     station = (place - origin) / unit
-    values, size, _ = lifted_data(rows, right, station)
+    values, _, _ = lifted_data(rows, right, station)
     count, d = station.shape
-    program = lifted_problem(count, d)
-    set_parameters(program, values)
-    lift = variable(program, "lift")
+    # ranges in standard deviations: a cost of a few of them is else rounding beside the squares of the ranges
+    change, inner = np.eye(1 + d + count), in_deviations(rows, right)
+    change[1 + d :, 1 + d :], change[1 + d :, 0] = inner[:, :-1], inner[:, -1]
+    table = np.concatenate([(rows @ inner[:, -1] - right)[:, None], rows @ inner[:, :-1]], axis=1)
+    size = float(np.abs(table).max()) or 1.0
+    program = lifted_problem(count, d, change)
+    set_parameters(program, {**values, "gram": table.T @ table / size**2})
+    lift = change @ variable(program, "lift") @ change.T
 
     def read() -> Array:
         return np.asarray(vectors(problem, (origin + unit * lift.value[0, 1 : 1 + d])[None, None])[0])

@@ -17,8 +17,7 @@ from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
-from optloc.solvers.starts.squared_range import Pick, Squared, last_weighting
-from optloc.solvers.starts.squared_range import hull as pick_hull, shor as pick_shor
+from optloc.solvers.starts.squared_range import Pick, Squared, hull as pick_hull, last_weighting, shor as pick_shor
 
 _NO_RANGE = "the last unknown is the square of the distance, and no range is an unknown"
 
@@ -65,7 +64,14 @@ def pose_shor(problem: Problem, locate: Locate) -> ConicStatement:
         return np.concatenate([plain[None, :n, n], mixed_points(plain, quadric)])
 
     return _statement(
-        problem, given, program, lift[:n, n], scale, points, lambda: rank_ratio(lift.value), tight("CLARABEL", TOLERANCE)
+        problem,
+        given,
+        program,
+        lift[:n, n],
+        scale,
+        points,
+        lambda: rank_ratio(lift.value),
+        tight("CLARABEL", TOLERANCE),
     )
 
 
@@ -97,7 +103,9 @@ def _rows(problem: Problem, pick: Pick) -> _Weighted:
 
     if not one_position(problem):
         raise InvalidProblem(
-            "squared ranges serve one target at one position", "formulation", 'use "nls", or "registration_sdp" for runs'
+            "squared ranges serve one target at one position",
+            "formulation",
+            'use "nls", or "registration_sdp" for runs',
         )
     alone = problem_at_rest(problem.straightened())
     squared, rows, right = last_weighting(alone, ranges(alone), pick)

@@ -38,6 +38,8 @@ class ConicStatement:
         Returns starting vectors (q, size) from the values of the variables, the point of the relaxation first.
     rank_ratio : callable
         Returns the distance of the solution from a point; near zero means exact.
+    within : str
+        Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
     settings : mapping of str to float
         Settings of Clarabel with which the method of the same name solves.
     """
@@ -52,6 +54,7 @@ class ConicStatement:
     parts: Mapping[str, Any] = field(default_factory=dict)
     residual: Any = None
     missing: Mapping[str, str] = field(default_factory=dict)
+    within: str = ""
     settings: Mapping[str, float] = field(default_factory=dict)
 
 
