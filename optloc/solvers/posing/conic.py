@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,13 +14,12 @@ from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
-from optloc.solvers.posing.posed import Posed, Relation
-from optloc.solvers.posing.statement import ConicStatement
+from optloc.solvers.posing.convex_program import ConvexProgram
+from optloc.solvers.posing.posed import Posed
+from optloc.solvers.posing.statement import ConicStatement, Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
-# Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
-_SEED = 20261130
 
 
 class PosedConic(Posed):
@@ -40,8 +38,8 @@ class PosedConic(Posed):
     def __init__(self, stated: Problem, formulation: str, statement: ConicStatement) -> None:
         super().__init__(stated, formulation)
         self.statement, self.origin, self.unit = statement, statement.origin, statement.unit
-        # The program that is solved has numbers of order one; `problem` has the same constraints and the cost itself.
-        self._goal, self._size, self._constant = statement.program.objective.args[0], statement.size, statement.constant
+        self._convex = ConvexProgram(statement.program, statement.size, statement.constant, statement.settings)
+        self.relations = self._convex.relations
         self._restate()
         for constraint in stated.constraints:
             self._take_over(constraint)
@@ -88,28 +86,18 @@ class PosedConic(Posed):
 
     def minimise(self, expression: Any) -> None:
         """Replace the objective by a convex expression of your own; see `Posed.minimise`."""
-        import cvxpy as cp
-
-        if isinstance(expression, cp.Minimize):
-            expression = expression.args[0]
-        if not isinstance(expression, cp.Expression) or expression.size != 1:
-            raise InvalidProblem("the objective is not a scalar expression of cvxpy", "objective", "sum its entries")
-        self._check_unknowns(expression, "objective")
-        if not (expression.is_convex() and expression.is_dcp()):
-            raise InvalidProblem(
-                "the objective is not convex by cvxpy's rules",
-                "objective",
-                "use the formulation 'nls' or a convex atom",
-            )
-        size = float(self._units(expression)[0])
-        self._goal, self._size, self._constant, self.own_objective = cp.sum(expression) / size, size, 0.0, True
+        self._convex.minimise(expression)
+        self._convex.settings, self.own_objective = {}, True
         self._restate()
 
-    def _check_unknowns(self, expression: Any, where: str) -> None:
-        """Raise InvalidProblem if an expression contains no variable of the program."""
-        own = {one.id for one in self.statement.program.variables()}
-        if not own & {one.id for one in expression.variables()}:
-            raise InvalidProblem("it has no unknown of this problem", where, "use posed.position or posed.of(name)")
+    def _restate(self) -> None:
+        """Write `problem` anew after a change."""
+        self._convex.restate()
+        self.problem = self._convex.problem
+
+    def _relation(self, constraint: Any, name: str) -> Relation:
+        """Return a relation of cvxpy, divided by its own unit."""
+        return self._convex.relation(constraint, name)
 
     def _as_planes(self, constraint: Any, name: str) -> list[Band]:
         """Return planes that a linear relation of the position alone states; empty for any other relation."""
@@ -120,9 +108,9 @@ class PosedConic(Posed):
         expression, position = constraint.expr, self.statement.parts.get("position")
         if position is None or not expression.is_affine() or expression.parameters():
             return []
-        self._check_unknowns(expression, "constraint")
-        with self._probe(expression, position):
-            slope, place = self._gradient(expression), self._gradient(position)
+        self._convex.check_unknowns(expression, "constraint")
+        with self._convex.probe(expression, position):
+            slope, place = self._convex.gradient(expression), self._convex.gradient(position)
             names = sorted(place.keys() | slope.keys(), key=lambda one: one.id)
             full = [np.concatenate([_rows_of(part, one, size) for one in names], axis=1) for part, size in
                     ((place, position.size), (slope, expression.size))]  # fmt: skip
@@ -141,41 +129,6 @@ class PosedConic(Posed):
             for low, up, direction in zip(lower, offset / length, normal / length[:, None], strict=True)
         ]
 
-    def _relation(self, constraint: Any, name: str) -> Relation:
-        """Return a relation of cvxpy, divided by its own unit."""
-        import cvxpy as cp
-
-        kinds = cp.constraints
-        if not isinstance(constraint, kinds.Constraint):
-            raise InvalidProblem(
-                f"{type(constraint).__name__} is no relation of cvxpy and no constraint of optloc.constraints",
-                "constraint",
-                "write a relation such as posed.position[0] <= 100",
-            )
-        for expression in constraint.args:
-            if expression.variables():
-                break
-        self._check_unknowns(constraint, "constraint")
-        if not constraint.is_dcp():
-            raise InvalidProblem(
-                f"the constraint {name!r} is not convex by cvxpy's rules", "constraint", "use the formulation 'nls'"
-            )
-        if isinstance(constraint, kinds.SOC | kinds.PSD):
-            unit = float(np.max(np.concatenate([self._units(one) for one in constraint.args])))
-            return Relation(
-                name, (type(constraint)(*(one / unit for one in constraint.args)),), (np.array(unit),), True
-            )
-        if isinstance(constraint, kinds.Inequality | kinds.Equality):
-            left, equal = constraint.expr, isinstance(constraint, kinds.Equality)
-        elif isinstance(constraint, kinds.NonNeg | kinds.NonPos | kinds.Zero):
-            sign = -1.0 if isinstance(constraint, kinds.NonNeg) else 1.0
-            left, equal = sign * constraint.args[0], isinstance(constraint, kinds.Zero)
-        else:
-            return Relation(name, (constraint,), (np.array(1.0),), True)
-        unit = self._units(left).reshape(left.shape, order="F")
-        divided = cp.multiply(1.0 / unit, left)
-        return Relation(name, (divided == 0.0 if equal else divided <= 0.0,), (unit,), True)
-
     def _table_relation(self, constraint: Any, name: str) -> Relation:
         """Return a constraint of the table as relations of cvxpy, divided by the unit of length."""
         import cvxpy as cp
@@ -190,50 +143,6 @@ class PosedConic(Posed):
                 parts.append(cp.norm(away) <= one.radius / self.unit)
         return Relation(name, tuple(parts), tuple(np.array(self.unit) for _ in parts), free=False)
 
-    def _restate(self) -> None:
-        """Write the program that is solved, and the problem with the cost itself, anew."""
-        import cvxpy as cp
-
-        rules = [*self.statement.program.constraints, *(part for one in self.relations.values() for part in one.parts)]
-        self._program = cp.Problem(cp.Minimize(self._goal), rules)
-        self.problem = cp.Problem(cp.Minimize(self._size * self._goal + self._constant), rules)
-
-    # Units: the length of the gradient in the variables of the program, which are of order one.
-
-    def _units(self, expression: Any) -> Array:
-        """Return the lengths of the gradients of the entries of an expression, in column order; one where it is zero."""
-        with self._probe(expression):
-            slope = self._gradient(expression)
-        total = np.zeros(expression.size)
-        for part in slope.values():
-            total += (part**2).sum(axis=1)
-        unit = np.sqrt(total)
-        return np.where(np.isfinite(unit) & (unit > 0.0), unit, 1.0)
-
-    @staticmethod
-    def _gradient(expression: Any) -> dict[Any, Array]:
-        """Return the derivatives (entries, variable entries) of an expression by each variable; empty where undefined."""
-        out = {}
-        for one, matrix in expression.grad.items():
-            if matrix is not None:
-                dense = matrix.toarray() if hasattr(matrix, "toarray") else np.atleast_2d(matrix)
-                out[one] = np.asarray(dense, dtype=float).reshape(one.size, expression.size).T
-        return out
-
-    @contextmanager
-    def _probe(self, *expressions: Any) -> Iterator[None]:
-        """Give all variables of expressions arbitrary values of order one, and restore their values at the end."""
-        rng, before = np.random.default_rng(_SEED), {}
-        every = {one.id: one for expression in expressions for one in expression.variables()}
-        try:
-            for one in every.values():
-                before[one.id] = one.value
-                one.value = one.project(rng.uniform(0.5, 1.5, one.shape))
-            yield
-        finally:
-            for one in every.values():
-                one.value = before.get(one.id)
-
     # The solution.
 
     def solve(
@@ -247,79 +156,24 @@ class PosedConic(Posed):
         refine: bool | None = None,
     ) -> Fix:
         """Return the judged fix of the posed problem; see `Posed.solve`."""
-        from formulations.conic_solvers import SOLVERS, solve_problem
-
-        name = (solver or "CLARABEL").upper()
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
-        own = {**(self.statement.settings if name == "CLARABEL" and not self.own_objective else {}), **(settings or {})}
-        takes = name in SOLVERS and SOLVERS[name].takes_start
-        try:
-            if warm and takes:
-                self._warm(start)
-            report = solve_problem(self._program, name, own, warm=warm)
-        except ValueError as trouble:
-            raise InvalidProblem(str(trouble), "solver", "see 'optloc list solvers'") from None
-        if warm and not takes:
-            text = f"{name} does not use start and duals, because it is an interior-point or simplex method"
-            report = replace(report, message="; ".join(filter(None, [report.message, text])))
-        solved = report.outcome in ("solved", "inaccurate") and self._has_values()
-        answer = self._answer(report, solved)
-        if not solved:
-            return self._explain_failure(answer)
-        return self._conclude(self.statement.read(), answer, refine)
-
-    def _has_values(self) -> bool:
-        """Return whether all variables of the program have finite values."""
-        return all(one.value is not None and np.isfinite(one.value).all() for one in self._program.variables())
-
-    def _warm(self, start: Any) -> None:
-        """Give the variables the values of an earlier answer."""
         earlier = getattr(start, "posed", start)
-        if isinstance(earlier, PosedAnswer):
-            for one in self._program.variables():
-                value = earlier.variables.get(one.name())
-                if value is not None and np.shape(value) == one.shape:
-                    one.value = one.project(value)
-
-    def _answer(self, report: Any, solved: bool) -> PosedAnswer:
-        """Return the answer with the report of a back end; its numbers are NaN without a solution."""
-        duals: dict[str, float | Array] = {}
-        values: dict[str, float | Array] = {}
-        for name, one in self.relations.items():
-            pairs = list(zip(one.parts, one.divisor, strict=True))
-            duals[name] = _joined(
-                [self._size * _dual(part) / unit if solved else np.nan * unit for part, unit in pairs]
-            )
-            values[name] = _joined([_value(part) * unit if solved else np.nan * unit for part, unit in pairs])
-        value = float(self._size * self._goal.value + self._constant) if solved else np.nan
-        return PosedAnswer(
+        first = earlier.variables if isinstance(earlier, PosedAnswer) else None
+        report = self._convex.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=first)
+        solved = self._convex.has_solution(report)
+        own_duals, values, cost = self._convex.results(solved=solved)
+        answer = PosedAnswer(
             self.formulation,
-            duals,
+            own_duals,
             values,
             report,
-            value,
-            self._bound() if solved else np.nan,
+            cost,
+            self._convex.bound() if solved else np.nan,
             self.statement.rank_ratio() if solved else np.nan,
             refined=False,
-            variables={one.name(): np.array(one.value) for one in self._program.variables()} if solved else {},
+            variables=self._convex.variables() if solved else {},
         )
-
-    def _bound(self) -> float:
-        """Return a lower bound of the objective, recomputed from a dual point of Clarabel; NaN if there is none."""
-        from formulations.backend import SolverError
-        from formulations.conic import Relaxation
-
-        kept = {one.id: one.value for one in self._program.variables()}
-        try:
-            relaxation = Relaxation(self._program, settings=dict(self.statement.settings))
-            numbers = {one.name(): np.asarray(one.value) for one in self._program.parameters()}
-            low = relaxation.solve(numbers).bound
-        except (ValueError, SolverError, AttributeError, KeyError):  # a problem beyond second-order and PSD cones
-            low = np.nan
-        finally:
-            for one in self._program.variables():
-                one.value = kept[one.id]
-        return float(self._size * low + self._constant) if np.isfinite(low) else np.nan
+        return self._conclude(self.statement.read(), answer, refine) if solved else self._explain_failure(answer)
 
     def _explain_failure(self, answer: PosedAnswer) -> Fix:
         """Return a fix without an answer and its reason, from the outcome of the back end."""
@@ -338,30 +192,3 @@ class PosedConic(Posed):
 def _rows_of(slope: Mapping[Any, Array], one: Any, size: int) -> Array:
     """Return the derivatives (size, entries) by a variable; zeros if there are none."""
     return slope[one] if one in slope else np.zeros((size, one.size))
-
-
-def _dual(part: Any) -> Array:
-    """Return the dual value of a relation; for a cone, the multiplier of its bound."""
-    dual = part.dual_value
-    if isinstance(dual, list | tuple):
-        dual = dual[0]
-    return np.asarray(np.nan if dual is None else dual, dtype=float)
-
-
-def _value(part: Any) -> Array:
-    """Return left side minus right side of a relation; for a cone, the length minus its bound."""
-    import cvxpy as cp
-
-    if isinstance(part, cp.constraints.SOC):
-        return np.asarray(np.linalg.norm(np.atleast_2d(part.args[1].value), axis=-1 - part.axis) - part.args[0].value)
-    if hasattr(part, "expr"):
-        return np.asarray(part.expr.value, dtype=float)
-    return np.asarray(part.args[0].value, dtype=float)
-
-
-def _joined(values: Sequence[Array]) -> float | Array:
-    """Return a single number as float, and several numbers as one vector or in their own shape."""
-    if len(values) == 1:
-        one = np.asarray(values[0])
-        return float(one.ravel()[0]) if one.size == 1 else one
-    return np.concatenate([np.ravel(one) for one in values])

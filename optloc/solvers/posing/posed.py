@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,32 +17,11 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import begin, in_parts, noting_place, pack
+from optloc.solvers.posing.statement import Relation
 from optloc.solvers.solution import with_sources
 from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 
 _REFINEMENT = Method(("lsr", "certify"))
-
-
-@dataclass(frozen=True, slots=True)
-class Relation:
-    """A named constraint of a posed problem, one entry for each scalar relation ``left - right <= 0`` or ``== 0``.
-
-    Parameters
-    ----------
-    name : str
-        Name for duals and messages.
-    parts : tuple
-        Relations in the language of the back end, normalised.
-    divisor : tuple of array
-        For each part, the numbers in SI units by which it is divided.
-    free : bool
-        Whether it holds in the posed problem only; else it is a constraint of the `Problem` too.
-    """
-
-    name: str
-    parts: tuple[Any, ...]
-    divisor: tuple[Array, ...]
-    free: bool
 
 
 class Posed(ABC):
