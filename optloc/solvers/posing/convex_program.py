@@ -1,4 +1,4 @@
-"""A convex program of cvxpy that users change: relations in SI units, units of gradients, duals and a recomputed bound."""
+"""A convex program of cvxpy that users change: relations in SI units, duals, and a recomputed bound."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class ConvexProgram:
     # Units: the length of the gradient in the variables of the program, which are of order one.
 
     def units(self, expression: Any) -> Array:
-        """Return the lengths of the gradients of the entries of an expression, in column order; one where it is zero."""
+        """Return the lengths (entries,) of the gradients of an expression, in column order; one where it is zero."""
         with self.probe(expression):
             slope = self.gradient(expression)
         total = np.zeros(expression.size)
@@ -123,7 +123,7 @@ class ConvexProgram:
 
     @staticmethod
     def gradient(expression: Any) -> dict[Any, Array]:
-        """Return the derivatives (entries, variable entries) of an expression by each variable; empty where undefined."""
+        """Return the derivatives (entries, q) of an expression by each variable of q entries; empty where undefined."""
         out = {}
         for one, matrix in expression.grad.items():
             if matrix is not None:

@@ -109,7 +109,7 @@ def _by_slot(layout: Layout, column: Array, values: Any) -> dict[str, Any]:
 
 
 def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
-    """Return the relaxation of a flat batch of one source at rest, weighted by the pass before; `locate` is not used."""
+    """Return the last pass of the relaxation of a flat batch of one source at rest; `locate` is not used."""
     from formulations.conic import rank_ratio
     from formulations.doppler_sdp import DopplerScene, doppler_problem, last_pass, settings_of
 

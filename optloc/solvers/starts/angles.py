@@ -223,7 +223,7 @@ def sights(seen: Bearings, i: int, use: Array) -> dict[str, Array | None]:
 
 
 def cones_of(seen: Bearings, i: int) -> tuple[Array, Array, Array] | None:
-    """Return directions (m, d), stations (m, d) and scales (m,) of the cones of problem i; None without two bearings."""
+    """Return directions and stations (m, d) and scales (m,) of the cones of problem i; None without two bearings."""
     d = seen.station.shape[-1]
     use = (seen.weight[i, :, : d - 1] > 0.0).all(-1) & np.isfinite(seen.angle[i]).all(-1)
     if use.sum() < 2:

@@ -199,7 +199,7 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
         method = _relax if relax and count == 3 else _intersect
         parts += [method(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
-        return np.full((size, 0, 3), np.nan)
+        return np.full((problem.batch_shape[0], 0, 3), np.nan)
     return problem.frame.from_ecef(np.concatenate(parts, axis=1) * WGS84_A)
 
 

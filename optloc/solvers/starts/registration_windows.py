@@ -55,7 +55,7 @@ def has_windows(problem: Problem, run: RegistrationRun) -> bool:
 
 
 def windows_of(problem: Problem, run: RegistrationRun) -> Iterator[dict[str, Any] | None]:
-    """Yield the arguments of `formulations.registration_sdp.registration` for each run; None with fewer than two windows.
+    """Yield the arguments of `formulations.registration_sdp.registration` for each run; None without two windows.
 
     Parameters
     ----------
