@@ -24,25 +24,22 @@ Trends Optim. 1 (2014), section 6.3 (the projection).
 from __future__ import annotations
 
 import threading
-import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass, replace
-from functools import lru_cache, wraps
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from formulations.algebra import Array, Index
 from formulations.backend import Ending, SolverError, choice_for, count, first_sentence, hold_in_forks, record
+from formulations.conic_solvers import adapter, read_clarabel, solve_with_status
+from formulations.cvxpy_access import LOCK, AffineMap, cone_program, dual_values
+from formulations.solver_report import SolverReport
 
 _Arguments = ParamSpec("_Arguments")
 _Built = TypeVar("_Built")
-
-# cvxpy counts its variables in a global that is read and written in two steps, and stores the values of parameters in
-# the problem. Two threads could give two variables the same number, or solve each other's data.
-_CVXPY = threading.RLock()
-hold_in_forks(_CVXPY)
 
 # Number of cached problems: more sizes of one problem than a study mixes. Building takes 10 ms to 0.5 s. A problem
 # takes less than 2 MB (moments of seven ranges, eight directions), or 20 MB (registration with eight windows, moving
@@ -68,8 +65,12 @@ class ConicAnswer:
         Whether the solver met its full tolerances.
     iterations : int
         Interior-point (or other) iterations.
+    report : SolverReport
+        The solver's own report: status, residuals, gap, iterations and seconds.
     message : str
         Message of the solver, for instance the reason of a failure; empty if there is none.
+    read_duals : callable
+        Returns `duals`, which are computed when they are read.
     """
 
     values: Mapping[str, Array]
@@ -78,7 +79,17 @@ class ConicAnswer:
     status: str
     solved: bool
     iterations: int
+    report: SolverReport
     message: str = ""
+    read_duals: Callable[[], tuple[Array, ...]] = field(default=tuple, repr=False, compare=False)
+
+    @property
+    def duals(self) -> tuple[Array, ...]:
+        """Return the dual value of each constraint, in the order of ``problem.constraints`` and in cvxpy's signs.
+
+        A second-order cone has its parts in one vector. The tuple is empty if the solver ended without a dual point.
+        """
+        return self.read_duals()
 
 
 class Relaxation:
@@ -113,7 +124,7 @@ class Relaxation:
     ) -> None:
         self.problem, self.backend, self.settings, self.radius = problem, backend, dict(settings or {}), radius
         self.parameters = {parameter.name(): parameter for parameter in problem.parameters()}
-        with _CVXPY:
+        with LOCK:
             self._shared = Data(problem) if backend == "CLARABEL" else None
         self._own = threading.local()
 
@@ -150,7 +161,7 @@ class Relaxation:
         choice, data = choice_for("conic"), self._data
         backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
         if data is None or backend != "CLARABEL":
-            with _CVXPY:
+            with LOCK:
                 answer = self._solve_by_cvxpy(values, backend, settings)
         else:
             answer = self._solve_by_clarabel(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
@@ -186,30 +197,22 @@ class Relaxation:
         at = x if status in _MET else np.full(len(x), np.nan)
         quadratic = float(at @ data.square(at))
         primal = 0.5 * quadratic + float(data.q @ at) + data.d
-        return ConicAnswer(data.recover(at), primal, low, status, status == "Solved", int(solution.iterations))
+        report = read_clarabel(solution)
+        duals = partial(data.shared.duals, z) if np.isfinite(z).all() else tuple
+        return ConicAnswer(
+            data.recover(at), primal, low, status, status == "Solved", report.iterations, report, "", duals
+        )
 
     def _solve_by_cvxpy(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> ConicAnswer:
         """Return the solution by another back end through cvxpy; it has no lower bound."""
-        import cvxpy
-
         for name, value in values.items():
             self.parameters[name].value = value
-        _clear_values(self.problem)
-        status, message = cvxpy.settings.SOLVER_ERROR, ""
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the status reports an inaccurate solution
-                # cvxpy would start from the previous solution, so that results would depend on their order
-                self.problem.solve(solver=backend, **{"warm_start": False, **settings})
-        except cvxpy.error.SolverError as trouble:
-            message = first_sentence(trouble)
-        except Exception as trouble:  # noqa: BLE001  (a back end may raise anything; its program stays usable)
-            message = f"{type(trouble).__name__}: {first_sentence(trouble)}"
-        else:
-            status = str(self.problem.status)
-        stats = None if message else self.problem.solver_stats
-        iterations = int(stats.num_iters or 0) if stats is not None else 0
-        good = status == cvxpy.OPTIMAL or (status == cvxpy.OPTIMAL_INACCURATE and backend in _REDUCED)
+            # a start at the previous solution would make results depend on their order
+            report, status = solve_with_status(self.problem, backend, settings)
+        except ValueError as trouble:
+            report, status = SolverReport(backend, "error", message=str(trouble)), "solver_error"
+        good = report.outcome == "solved" or (report.outcome == "inaccurate" and adapter(backend).reduced)
         found = {v.name(): v.value for v in self.problem.variables()} if good else {}
         good = good and all(value is not None and np.isfinite(value).all() for value in found.values())
         point = {
@@ -217,7 +220,10 @@ class Relaxation:
             for v in self.problem.variables()
         }
         primal = float(self.problem.value) if good else np.nan
-        return ConicAnswer(point, primal, -np.inf, status, good and status == cvxpy.OPTIMAL, iterations, message)
+        duals = dual_values(self.problem) if good else ()
+        solved = good and report.outcome == "solved"
+        return ConicAnswer(point, primal, -np.inf, status, solved, report.iterations, report, report.message,
+                           lambda: duals)  # fmt: skip
 
 
 # Statuses of Clarabel with a solution: its tolerances are met, or its reduced tolerances (5e-5 of the gap, 1e-4 of
@@ -226,18 +232,6 @@ _MET = ("Solved", "AlmostSolved")
 # For a second attempt if the factorisation lost its digits: ten times the default of 1e-8. Relaxations of Doppler
 # shifts of satellites then meet the full tolerances, with a third more iterations.
 _REGULAR = {"static_regularization_constant": 1e-7}
-# Back ends that report an inaccurate solution if their reduced tolerances are met. Others, for instance SCS, report any
-# last iterate as inaccurate.
-_REDUCED = ("ECOS", "QOCO")
-
-
-def _clear_values(problem: Any) -> None:
-    """Remove the values of the previous solve from a cvxpy problem, because a failed solve does not overwrite them."""
-    for variable in problem.variables():
-        variable.save_value(None)
-    for constraint in problem.constraints:
-        for dual in constraint.dual_variables:
-            dual.save_value(None)
 
 
 def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
@@ -269,7 +263,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
 
     def alone(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
         """Build while no other thread uses cvxpy."""
-        with _CVXPY:
+        with LOCK:
             return build(*args, **kwargs)
 
     # A cached result waits only for builds of the same function. Without this lock two threads would build it twice.
@@ -346,48 +340,37 @@ class Data:
     def __init__(self, problem: Any) -> None:
         import cvxpy
         import scipy.sparse as sp
-        from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 
         for parameter in problem.parameters():
             if parameter.value is None:
                 parameter.value = np.zeros(parameter.shape)
         if not (problem.is_dcp(dpp=True) and isinstance(problem.objective, cvxpy.Minimize)):
             raise ValueError("the problem must be a minimisation that follows cvxpy's rules for parameters (DPP)")
-        stuff, chain, inverse = problem.get_problem_data(cvxpy.CLARABEL)
-        self.program = stuff["param_prob"]
-        self.dims, self.cones = stuff["dims"], dims_to_solver_cones(stuff["dims"])
-        columns = self.program.param_id_to_col
-        self.slots = {p.name(): (columns[p.id], p.shape) for p in problem.parameters() if p.id in columns}
-        if len(self.slots) != len(problem.parameters()):
-            raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
+        self.shared = program = cone_program(problem)
+        self.dims, self.cones, self.slots = program.dims, program.cones, program.slots
         # all parameters in one vector, followed by a one for the constants of the affine maps
-        self.vector = np.zeros(self.program.total_param_size + 1)
+        self.vector = np.zeros(program.length + 1)
         self.vector[-1] = 1.0
-        n = self.program.x.size
-        self._linear = _Product.of(self.program.q)
+        n = program.size
+        self._linear = _Product.of(program.linear)
         # cvxpy stores [A, b] as one sparse matrix: the columns of A, then the column b
-        self._matrix, pattern = _affine(self.program.reduced_A)
-        m = pattern[2][0]
+        self._matrix, pattern = _Product.of(program.constraints.matrix), program.constraints
+        m = pattern.shape[0]
         self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
-        last = pattern[1][n]
-        self._left, self._rows = slice(0, last), pattern[0][last:]
+        last = pattern.starts[n]
+        self._left, self._rows = slice(0, last), pattern.rows[last:]
         self._quadratic: _Product | None = None
         self._upper = np.zeros(0, dtype=np.int64)
-        self.A = sp.csc_array((np.zeros(last), pattern[0][:last], pattern[1][: n + 1]), shape=(m, n))
+        self.A = sp.csc_array((np.zeros(last), pattern.rows[:last], pattern.starts[: n + 1]), shape=(m, n))
         self.P = sp.csc_array((n, n))
-        if self.program.P is not None:
-            self._quadratic, pattern = _affine(self.program.reduced_P)
-            # Clarabel takes the upper triangle of P only
-            column = np.repeat(np.arange(n), np.diff(pattern[1]))
-            self._upper = np.flatnonzero(pattern[0] <= column)
-            row, column = pattern[0][self._upper], column[self._upper]
-            start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=n))])
-            self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
+        if program.quadratic is not None:
+            self._quadratic = _Product.of(program.quadratic.matrix)
+            self._upper, self.P = _upper_triangle(program.quadratic)
         self.across, self.below = _Product.transposed(self.A), _Product.transposed(self.P)
         self.above = _Product(n, self.below.source, self.below.row, self.P.data)
         # P x is the triangle times x plus its transpose times x, less the diagonal, which both contain
         self._ridge = np.where(self.below.row == self.below.source, 0.0, 1.0)
-        self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
+        self._recover = program.recovery
 
     def feed(self, values: Mapping[str, Array]) -> None:
         """Write the data for new parameter values.
@@ -489,34 +472,19 @@ class _Product:
         return np.asarray(total, dtype=np.float64)
 
 
-def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]]]:
-    """Return the map from the parameter vector to the stored entries of a matrix, and their compressed-column pattern.
+def _upper_triangle(pattern: AffineMap) -> tuple[Index, Any]:
+    """Return the positions of the entries of the upper triangle of P among its entries, and the triangle, zero.
 
-    The pattern is row indices, column starts, and shape.
+    Clarabel takes the upper triangle of P only.
     """
-    reduced.cache()
-    if reduced.problem_data_index is None:
-        raise ValueError("the problem has no constraint")
-    return _Product.of(reduced.reduced_mat), reduced.problem_data_index
+    import scipy.sparse as sp
 
-
-def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
-    """Return, for each variable, its name, the matrix that maps the solver's x (n,) to it, and its shape.
-
-    cvxpy's reductions (`chain`, with the data `inverse`) are undone on unit vectors. `name` is the id of x.
-    """
-    from cvxpy.reductions.solution import Solution
-
-    columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
-    for unit in np.eye(n):
-        solution = Solution("optimal", 0.0, {name: unit}, None, {})
-        for reduction, data in zip(reversed(chain.reductions[:-1]), reversed(inverse[:-1]), strict=True):
-            solution = reduction.invert(solution, data)
-        for variable in problem.variables():
-            value = solution.primal_vars[variable.id]
-            dense = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
-            columns[variable.id].append(dense.ravel(order="F"))
-    return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
+    n = pattern.shape[1]
+    column = np.repeat(np.arange(n), np.diff(pattern.starts))
+    upper = np.flatnonzero(pattern.rows <= column)
+    row, column = pattern.rows[upper], column[upper]
+    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=n))])
+    return upper, sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
 
 
 # Projection on the dual of a product of cones, which makes the dual point of a solver feasible.

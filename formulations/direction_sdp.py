@@ -102,12 +102,7 @@ def directions(
     -----
     The module's text. Built once per N and back end in each process.
     """
-    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
-    flat = 1.0 / (s[:, 0] * np.maximum(np.cos(z[:, 1]), _LEVEL)) ** 2
-    steep = 1.0 / s[:, 1] ** 2
-    square = np.stack([radial * np.minimum(flat, steep), flat, steep], axis=-1)
-    cost = _Cost(0.0, np.zeros_like(square), square, 4.0 * len(z))
-    return _solve(_frames(z, axes), np.asarray(station, dtype=np.float64), cost, backend)
+    return _solve(chordal_program(angle, sigma, station, axes=axes, radial=radial), backend)
 
 
 def angle_bound(
@@ -145,7 +140,7 @@ def angle_bound(
     error[:, 0] = np.arctan2(np.sin(error[:, 0]), np.cos(error[:, 0]))
     found = minorant(error, s, seen[:, 1], float(((error / s) ** 2).sum()))
     cost = _Cost(float(found.constant.sum()), found.linear, found.square, float((found.reach**2).sum()))
-    return _solve(_frames(seen, axes), S, cost, backend)
+    return _solve(_program(_frames(seen, axes), S, cost), backend)
 
 
 # Quadratic functions of a unit direction that stay below its squared angle errors and touch them at one direction.
@@ -300,9 +295,15 @@ def direction_problem(count: int) -> Any:
 @keep
 def _relaxation(count: int, backend: str) -> Relaxation:
     """Return the relaxation for `count` directions, built once for each size and back end."""
-    # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early
-    settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
-    return Relaxation(direction_problem(count), backend=backend, settings=settings)
+    return Relaxation(direction_problem(count), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation for a back end.
+
+    The equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in five stops early.
+    """
+    return tight(backend, 1e-9, static_regularization_constant=1e-7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,11 +330,73 @@ def _frames(angle: Array, axes: ArrayLike | None) -> Array:
     return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
 
 
-def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
-    """Return the solution of the relaxation for a quadratic cost in the frames (N, 3, 3) of the reference directions.
+@dataclass(frozen=True, slots=True)
+class DirectionProgram:
+    """The data of the relaxation.
 
-    S (N, 3) are the stations.
+    Parameters
+    ----------
+    frame : Array, shape (N, 3, 3)
+        Reference directions and their tangents, as rows.
+    station : Array, shape (N, 3)
+        Positions.
+    weight : Array, shape (N, 3)
+        Quadratic coefficients of the cost in ``w``, the changes from the reference directions.
+    unit : float
+        Unit of w.
+    constant : float
+        Constant of the cost.
+    values : dict of str to Array
+        Parameters of `direction_problem`.
+    longest : float
+        Greatest length of the lift of any relevant point.
     """
+
+    frame: Array
+    station: Array
+    weight: Array
+    unit: float
+    constant: float
+    values: dict[str, Array]
+    longest: float
+
+    @property
+    def change(self) -> tuple[Array, Array]:
+        """Return the matrix (3N, 3N) and the vector (3N,) that map w in its unit to the directions."""
+        count = len(self.station)
+        matrix = np.zeros((3 * count, 3 * count))
+        for i in range(count):
+            own = slice(3 * i, 3 * i + 3)
+            matrix[own, own] = self.unit * self.frame[i].T
+        return matrix, self.frame[:, 0].ravel()
+
+    def lift_of_directions(self, lift: Array) -> Array:
+        """Return the lift of (1, v) from the lift of (1, w); the rank is evaluated in the directions v."""
+        matrix, base = self.change
+        whole = np.block([[np.ones((1, 1)), np.zeros((1, len(base)))], [base[:, None], matrix]])
+        return np.asarray(whole @ lift @ whole.T)
+
+    def read(self, lift: Array) -> tuple[Array, Array]:
+        """Return the intersection (3,) and the unit directions (N, 3) of the first moments of a lift."""
+        v = self.lift_of_directions(lift)[1:, 0].reshape(len(self.station), 3)
+        v = v / np.linalg.norm(v, axis=1, keepdims=True)
+        return meeting(v, self.station), v
+
+
+def chordal_program(
+    angle: ArrayLike, sigma: ArrayLike, station: ArrayLike, *, axes: ArrayLike | None = None, radial: float = 1.0
+) -> DirectionProgram:
+    """Return the data of the chordal relaxation; arguments as in `directions`."""
+    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    flat = 1.0 / (s[:, 0] * np.maximum(np.cos(z[:, 1]), _LEVEL)) ** 2
+    steep = 1.0 / s[:, 1] ** 2
+    square = np.stack([radial * np.minimum(flat, steep), flat, steep], axis=-1)
+    cost = _Cost(0.0, np.zeros_like(square), square, 4.0 * len(z))
+    return _program(_frames(z, axes), np.asarray(station, dtype=np.float64), cost)
+
+
+def _program(frame: Array, S: Array, cost: _Cost) -> DirectionProgram:
+    """Return the data for a quadratic cost in the frames (N, 3, 3) of the reference directions; S (N, 3) are stations."""
     count = len(S)
     # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0
@@ -346,31 +409,27 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     turn = np.einsum("pai,pbi->pab", frame[pairs[:, 0]], across)
     near = np.einsum("pai,pi->pa", frame[pairs[:, 0]], base)
     far = np.einsum("pai,pi->pa", frame[pairs[:, 1]], base)
-    answer = _relaxation(count, backend).solve(
-        {
-            "linear": (cost.linear * unit).ravel(),
-            "square": (cost.square * unit**2).ravel(),
-            "unit": np.full(count, unit),
-            "level": turn[:, 0, 0] / unit,
-            "slope": np.concatenate([turn[:, :, 0], turn[:, 0, :]], axis=1),
-            "turn": unit * turn.reshape(-1, 9),
-            "start": (near[:, 0] - far[:, 0]) / unit,
-            "order": np.concatenate([near, -far], axis=1),
-        },
-        # |Y| of every relevant point
-        reach=1.0 + cost.reach / unit**2,
-    )
+    values = {
+        "linear": (cost.linear * unit).ravel(),
+        "square": (cost.square * unit**2).ravel(),
+        "unit": np.full(count, unit),
+        "level": turn[:, 0, 0] / unit,
+        "slope": np.concatenate([turn[:, :, 0], turn[:, 0, :]], axis=1),
+        "turn": unit * turn.reshape(-1, 9),
+        "start": (near[:, 0] - far[:, 0]) / unit,
+        "order": np.concatenate([near, -far], axis=1),
+    }
+    # the last number is |Y| of every relevant point
+    return DirectionProgram(frame, S, cost.square, unit, cost.constant, values, 1.0 + cost.reach / unit**2)
+
+
+def _solve(program: DirectionProgram, backend: str) -> Directed:
+    """Return the solution of the relaxation."""
+    count, constant = len(program.station), program.constant
+    answer = _relaxation(count, backend).solve(program.values, reach=program.longest)
     lift = answer.values["lift"]
-    v, plain = np.full((count, 3), np.nan), lift
+    point, v, ratio = np.full(3, np.nan), np.full((count, 3), np.nan), np.nan
     if np.isfinite(lift).all():
-        # from (1, w) back to (1, v): the rank is evaluated in the directions, not in scaled differences
-        change = np.zeros_like(lift)
-        change[0, 0] = 1.0
-        for i in range(count):
-            own = slice(1 + 3 * i, 4 + 3 * i)
-            change[own, 0], change[own, own] = frame[i, 0], unit * frame[i].T
-        plain = change @ lift @ change.T
-        v = plain[1:, 0].reshape(count, 3)
-        v = v / np.linalg.norm(v, axis=1, keepdims=True)
-    bound = cost.constant + answer.bound
-    return Directed(meeting(v, S), v, cost.constant + answer.primal, max(bound, 0.0), rank_ratio(plain), answer)
+        point, v = program.read(lift)
+        ratio = rank_ratio(program.lift_of_directions(lift))
+    return Directed(point, v, constant + answer.primal, max(constant + answer.bound, 0.0), ratio, answer)

@@ -40,7 +40,7 @@ side of a satellite's track, of which `Y` is the mean. Then the first moment is 
 contain both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
 local method and prove no uniqueness; they are worst for differences of rates of a single pair.
 
-The size is limited: `normal_points` averages rows that are adjacent in time.
+The size is limited: :mod:`formulations.normal_points` averages rows that are adjacent in time.
 
 Sources: B. Song, W. Wen, Q. Zhang, B. Xu and L.-T. Hsu, "Certifiably optimal Doppler positioning using opportunistic
 LEO satellites", arXiv:2509.17198 (2025) (place, ranges, clock drift and its products with the ranges lifted, and
@@ -53,7 +53,6 @@ that are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulatio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -72,7 +71,6 @@ from 36 led to the best minimum in 47 of 48 runs of a pair or of satellites, fro
 _PASSES = 2  # the second pass has the ranges of the first; a third pass changed no start of 40
 _LIMIT = 10.0  # limit of unknowns that are not rates, in speeds of the fastest node: far above their values after a fit
 _NEAREST = 1e-3  # least range in a weight, in units of length: at a station the weight would be infinite
-_BEND = 2  # degree of the polynomial of a normal point: within a block, rates of a satellite pass are nearly parabolas
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +242,23 @@ class DopplerScene:
         values |= {"reach": np.array(reach**2)} if self.surface is None else {"form": self.surface.shape}
         return values, size
 
+    def points(self, lift: Array) -> Array:
+        """Return points (1 + 2 d, d) in the units of the caller: the first moment of a lift, then points around it."""
+        d = self.shape.dimension
+        point = lift[0, 1 : 1 + d]
+        spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
+        step = (np.sqrt(np.maximum(spread, 0.0)) * axes).T[::-1]
+        points = point + np.concatenate([np.zeros((1, d)), np.stack([step, -step], axis=1).reshape(-1, d)])
+        if self.surface is not None:
+            # a mean of positions on a surface is below it: it is moved to the surface along the line to the centre
+            points = points / np.sqrt(np.einsum("ij,jk,ik->i", points, self.surface.shape, points))[:, None]
+        return np.asarray(self.origin + self.length * points)
+
+    def unknown(self, lift: Any) -> Any:
+        """Return b (p,) in the units of the caller, from a lift, an array or an expression."""
+        beta = self.shape.places[0]
+        return self.mean + np.diag(self.unit) @ lift[0, beta : beta + self.shape.unknowns]
+
     def longest(self, reach: float) -> float:
         """Return the greatest length of Y for any source within the reach; the bound from the dual needs it."""
         far = reach if self.surface is None else float(np.linalg.eigvalsh(self.surface.shape)[0]) ** -0.5
@@ -337,18 +352,44 @@ def doppler(
     if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
         return _no_start(S.shape[1], A.shape, None)
     scene = DopplerScene.of(S, V, values, W, R, Q, A, surface)
-    relaxation, far = _relaxation(scene.shape, backend), np.ones(len(values))
+    far, size, answer = last_pass(scene, reach=reach, backend=backend)
+    if not np.isfinite(answer.values["lift"]).all():
+        return _no_start(S.shape[1], A.shape, answer)
+    return _read_off(scene, far, size, answer)
+
+
+def last_pass(
+    scene: DopplerScene, *, reach: float = 10.0, backend: str = "CLARABEL"
+) -> tuple[Array, float, ConicAnswer]:
+    """Return the weights of the last pass and its solution.
+
+    Parameters
+    ----------
+    scene : DopplerScene
+        The scaled rows.
+    reach, backend
+        As in `doppler`.
+
+    Returns
+    -------
+    far : Array, shape (m,)
+        Ranges that divide the rows, scaled.
+    size : float
+        Unit of the cost.
+    answer : ConicAnswer
+        The solution; of the first pass if that failed.
+    """
+    relaxation, far = _relaxation(scene.shape, backend), np.ones(len(scene.pivot))
     for _ in range(_PASSES):
         given, size = scene.parameters(far, reach)
         answer = relaxation.solve(given, reach=scene.longest(reach))
-        lift = answer.values["lift"]
-        if not np.isfinite(lift).all():
-            return _no_start(S.shape[1], A.shape, answer)
         # value and bound of a pass belong to the ranges that divided its rows
-        weighted, point = far, lift[0, 1 : 1 + S.shape[1]]
-        apart = np.sqrt(((point - scene.place) ** 2).sum(axis=1))
+        weighted, lift = far, answer.values["lift"]
+        if not np.isfinite(lift).all():
+            break
+        apart = np.sqrt(((lift[0, 1 : 1 + scene.shape.dimension] - scene.place) ** 2).sum(axis=1))
         far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
-    return _read_off(scene, weighted, size, answer)
+    return weighted, size, answer
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:
@@ -356,18 +397,10 @@ def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer)
 
     `far` (m,) are the ranges that divided the rows, scaled; `size` is the unit of the cost.
     """
-    lift, d = answer.values["lift"], scene.shape.dimension
-    point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
-    spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
-    step = (np.sqrt(np.maximum(spread, 0.0)) * axes).T[::-1]
-    points = point + np.concatenate([np.zeros((1, d)), np.stack([step, -step], axis=1).reshape(-1, d)])
-    if scene.surface is not None:
-        # a mean of positions on a surface is below it: it is moved to the surface along the line to the centre
-        points = points / np.sqrt(np.einsum("ij,jk,ik->i", points, scene.surface.shape, points))[:, None]
-    unknown = scene.mean + scene.unit * lift[0, beta : beta + scene.shape.unknowns]
+    lift = answer.values["lift"]
     return DopplerStart(
-        scene.origin + scene.length * points,
-        unknown,
+        scene.points(lift),
+        scene.unknown(lift),
         np.where(scene.pivot < 0, 1.0, scene.length * far),
         answer.primal * size,
         max(answer.bound * size, 0.0),  # a sum of squares is not negative
@@ -466,18 +499,20 @@ def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> i
     return _shape((rates.shape[1], dimension), first, second, design, rate, False).places[-1]
 
 
-def doppler_problem(shape: Shape) -> Any:
+def doppler_problem(shape: Shape, change: Array | None = None) -> Any:
     """Build the relaxation as a cvxpy problem.
 
     Parameters
     ----------
     shape : Shape
         Structure of the lift.
+    change : Array, shape (n, n), optional
+        Other unknowns u, whose first is 1, with ``y = change u``; by default u is y.
 
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of shape (n, n), ordered (1, x, beta, r, w); parameters of `DopplerScene.parameters`.
+        Variable ``lift`` of shape (n, n) of u; parameters of `DopplerScene.parameters`, with ``gram`` in u.
 
     Notes
     -----
@@ -487,13 +522,14 @@ def doppler_problem(shape: Shape) -> Any:
 
     d, count = shape.dimension, shape.nodes
     beta, r, w, size = shape.places
-    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    own = cp.Variable((size, size), symmetric=True, name="lift")
+    lift = own if change is None else change @ own @ change.T
     gram = cp.Parameter((size, size), name="gram")
     station, square = cp.Parameter((count, d), name="station"), cp.Parameter(count, name="square")
     x, inside, far = lift[0, 1:beta], lift[1:beta, 1:beta], lift[0, r:w]
     rules = [
-        lift >> 0,
-        lift[0, 0] == 1,
+        own >> 0,
+        own[0, 0] == 1,
         cp.diag(lift)[r:w] == cp.trace(inside) - 2 * station @ x + square,
         far >= 0,
         *(cp.norm(x - station[i]) <= far[i] for i in range(count)),
@@ -510,7 +546,7 @@ def doppler_problem(shape: Shape) -> Any:
         rules += [lift[r + u, r + v] >= dot, lift[r + u, r + v] >= -dot]
     if r > beta:
         rules.append(cp.diag(lift)[beta:r] <= cp.Parameter(r - beta, name="limit"))
-    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, lift))), [*rules, *_products(shape, lift)])
+    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, own))), [*rules, *_products(shape, lift)])
 
 
 def _products(shape: Shape, lift: Any) -> list[Any]:
@@ -540,61 +576,9 @@ def _products(shape: Shape, lift: Any) -> list[Any]:
 @keep
 def _relaxation(shape: Shape, backend: str) -> Relaxation:
     """Return the relaxation, built once for each structure and back end."""
-    # a decade below the default of Clarabel: the errors of precise rows are 1e-5 of their rates
-    return Relaxation(doppler_problem(shape), backend=backend, settings=tight(backend, 1e-9))
+    return Relaxation(doppler_problem(shape), backend=backend, settings=settings_of(backend))
 
 
-def blocks(time: ArrayLike, length: int) -> list[Index]:
-    """Return rows, sorted by time, in blocks of nearly equal size.
-
-    Parameters
-    ----------
-    time : array_like, shape (m,)
-        Time of each row.
-    length : int
-        Greatest number of rows of a block, at least one.
-
-    Returns
-    -------
-    list of int arrays
-        The rows of each block.
-    """
-    order = np.argsort(np.asarray(time, dtype=np.float64), kind="stable")
-    return np.array_split(order, -(-len(order) // length)) if len(order) else []
-
-
-def normal_points(time: ArrayLike, z: ArrayLike, sigma: ArrayLike, cut: Sequence[Index]) -> tuple[Index, Array, Array]:
-    """Return averages of rows of the same instruments that are adjacent in time.
-
-    The average of a block is the value of a least-squares parabola at the time of its middle row. With too few
-    different times, it is the value of a line or a mean.
-
-    Parameters
-    ----------
-    time, z, sigma : array_like, shape (m,)
-        Times, values, and standard deviations of independent errors.
-    cut : sequence of q int arrays
-        The rows of each block, see `blocks`.
-
-    Returns
-    -------
-    row : int array, shape (q,)
-        The middle row of each block.
-    z, sigma : Array, shape (q,)
-        Averages and their standard deviations.
-
-    Notes
-    -----
-    The normal points of satellite laser ranging: A. T. Sinclair, "Data screening and normal point formation" (1997).
-    """
-    t, values, spread = (np.asarray(part, dtype=np.float64) for part in (time, z, sigma))
-    row = np.array([block[len(block) // 2] for block in cut], dtype=np.int64)
-    out, error = np.zeros(len(row)), np.zeros(len(row))
-    for k, (block, middle) in enumerate(zip(cut, row, strict=True)):
-        since = t[block] - t[middle]
-        # two rows more than coefficients, since a polynomial through all rows does not average
-        degree = min(_BEND, len(np.unique(since)) - 1, max(len(block) - 3, 0))
-        power = (since / (np.abs(since).max() or 1.0))[:, None] ** np.arange(degree + 1)
-        left = np.linalg.pinv(power / spread[block, None])[0] / spread[block]
-        out[k], error[k] = left @ values[block], np.sqrt(((left * spread[block]) ** 2).sum())
-    return row, out, error
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation: a decade below Clarabel's default, for errors of 1e-5 of the rates."""
+    return tight(backend, 1e-9)

@@ -60,19 +60,21 @@ class Lifted:
     answer: ConicAnswer
 
 
-def lifted_problem(count: int, dim: int) -> Any:
+def lifted_problem(count: int, dim: int, change: Array | None = None) -> Any:
     """Build the order-one relaxation as a cvxpy problem: a baseline, never a default.
 
     Parameters
     ----------
     count, dim : int
         M stations in d dimensions.
+    change : Array, shape (1 + d + M, 1 + d + M), optional
+        Other unknowns u, whose first is 1, with ``(1, x, r) = change u``; by default u is (1, x, r).
 
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of shape (1 + d + M, 1 + d + M), ordered (1, x, r); parameters ``gram`` (1 + M, 1 + M), the
-        products of ``[-z, K]``; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
+        Variable ``lift`` of shape (1 + d + M, 1 + d + M) of u; parameters ``gram`` (1 + M, 1 + M), the products of
+        ``[-z, K]`` in these unknowns; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
         largest ``|x|^2``, without which range differences leave the lift unbounded.
 
     Notes
@@ -82,14 +84,15 @@ def lifted_problem(count: int, dim: int) -> Any:
     import cvxpy as cp
 
     size, first = 1 + dim + count, 1 + dim
-    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    own = cp.Variable((size, size), symmetric=True, name="lift")
+    lift = own if change is None else change @ own @ change.T
     gram = cp.Parameter((1 + count, 1 + count), name="gram")
     station, square = cp.Parameter((count, dim), name="station"), cp.Parameter(count, name="square")
     reach = cp.Parameter(name="reach")
     x, r, diagonal = lift[0, 1:first], lift[0, first:], cp.diag(lift)
-    value = gram[0, 0] + 2 * gram[0, 1:] @ r + cp.sum(cp.multiply(gram[1:, 1:], lift[first:, first:]))
+    value = gram[0, 0] + 2 * gram[0, 1:] @ own[0, first:] + cp.sum(cp.multiply(gram[1:, 1:], own[first:, first:]))
     rules = [
-        lift >> 0,
+        own >> 0,
         lift[0, 0] == 1,
         diagonal[first:] == cp.sum(diagonal[1:first]) - 2 * station @ x + square,
         r >= 0,
@@ -101,8 +104,40 @@ def lifted_problem(count: int, dim: int) -> Any:
 @keep
 def _relaxation(count: int, dim: int, backend: str) -> Relaxation:
     """Return the relaxation for `count` stations in `dim` dimensions, built once for each size and back end."""
-    # a decade below the default of Clarabel, because the value that this baseline demonstrates is near zero
-    return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight(backend, 1e-9))
+    return Relaxation(lifted_problem(count, dim), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation for a back end.
+
+    The tolerance is a decade below the default of Clarabel, because the value that this baseline demonstrates is near
+    zero.
+    """
+    return tight(backend, 1e-9)
+
+
+def lifted_data(
+    rows: ArrayLike, right: ArrayLike, station: ArrayLike, *, reach: float = 10.0
+) -> tuple[dict[str, Array], float, float]:
+    """Return the data of the relaxation; arguments as in `lifted_ranges`.
+
+    Returns
+    -------
+    values : dict of str to Array
+        Parameters of `lifted_problem`.
+    size : float
+        The cost is the square of `size` times the objective.
+    longest : float
+        Greatest length of the lift of any point within the reach.
+    """
+    K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
+    table = np.concatenate([-z[:, None], K], axis=1)
+    size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
+    square = (S * S).sum(axis=1)
+    # |(1, x, r)|^2 of every point within the reach, which makes the bound rigorous
+    longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
+    values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
+    return values, size, longest
 
 
 def lifted_ranges(
@@ -132,16 +167,9 @@ def lifted_ranges(
     -----
     Yang, Wang and Luo (2009). Built once per size and back end in each process.
     """
-    K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
-    count, dim = S.shape
-    table = np.concatenate([-z[:, None], K], axis=1)
-    size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
-    relaxation = _relaxation(count, dim, backend)
-    square = (S * S).sum(axis=1)
-    # |(1, x, r)|^2 of every point within the reach, which makes the bound rigorous
-    longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
-    values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
-    answer = relaxation.solve(values, reach=longest)
+    values, size, longest = lifted_data(rows, right, station, reach=reach)
+    count, dim = values["station"].shape
+    answer = _relaxation(count, dim, backend).solve(values, reach=longest)
     lift = answer.values["lift"]
     point, ranges = lift[0, 1 : 1 + dim].copy(), lift[0, 1 + dim :].copy()
     bound = max(answer.bound, 0.0) * size**2  # a sum of squares is not negative

@@ -239,8 +239,12 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
 
 def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
     """Return the common points of cones whose half-angles are `level` times `scale` (N,), at most `_WIDEST`."""
-    theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
-    return common(u, S, theta, backend=backend)
+    return common(u, S, _half_angles(scale, level), backend=backend)
+
+
+def _half_angles(scale: Array, level: float) -> Array:
+    """Return half-angles (N,) that are `level` times `scale` (N,), at most `_WIDEST`; infinite for a dropped cone."""
+    return np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
 
 
 # The cone programs and their parameters.
@@ -249,11 +253,34 @@ def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: st
 @keep
 def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
     """Return the cone program "ball" or "edge" for `count` cones in `dim` dimensions, built once for each back end."""
-    settings = tight(backend, 1e-10)  # the sign of a margin is a proof: two decades below the default of Clarabel
+    settings = settings_of(backend)
     if kind == "edge":
         return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)
     # (p, 0) is feasible for every common point p, so emptiness is proven for all p with |p| <= radius (1 + ..)
     return Relaxation(ball_problem(count, dim), backend=backend, settings=settings, radius=_RADIUS)
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the cone programs for a back end.
+
+    The sign of a margin is a proof, so the tolerance is two decades below the default of Clarabel.
+    """
+    return tight(backend, 1e-10)
+
+
+def ball_data(direction: Array, station: Array, scale: Array, level: float) -> dict[str, Array]:
+    """Return the parameters of `ball_problem` for cones whose half-angles are a multiple of their scales.
+
+    Parameters
+    ----------
+    direction, station : Array, shape (N, d)
+        Unit directions and positions.
+    scale : Array, shape (N,)
+        Scale of each angle, radians; an infinite value drops a cone.
+    level : float
+        The multiple.
+    """
+    return _cone_data(direction, station, _half_angles(scale, level), ball=True)
 
 
 def ball_problem(count: int, dim: int) -> Any:

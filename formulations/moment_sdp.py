@@ -165,9 +165,54 @@ def moment_problem(stations: int, dimension: int) -> Any:
 @keep
 def _relaxation(stations: int, dimension: int, backend: str) -> Relaxation:
     """Return the relaxation, built once for each size and back end."""
-    # the equalities depend on each other at a solution: with Clarabel's default of 1e-8 one solve in four stops early
-    settings = tight(backend, 1e-8, static_regularization_constant=1e-7)
-    return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)
+    return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation for a back end.
+
+    The equalities depend on each other at a solution: with Clarabel's default regularisation one solve in four stops
+    early.
+    """
+    return tight(backend, 1e-8, static_regularization_constant=1e-7)
+
+
+@dataclass(frozen=True, slots=True)
+class MomentProgram:
+    """The data of the relaxation.
+
+    Parameters
+    ----------
+    values : dict of str to Array
+        Parameters of `moment_problem`.
+    size : float
+        The cost is `size` times the objective.
+    white : Array, shape (q, M + 1)
+        Residuals in standard deviations, linear in ``(1, t, omega)``.
+    box : EnclosingBox
+        The box.
+    """
+
+    values: dict[str, Array]
+    size: float
+    white: Array
+    box: EnclosingBox
+
+
+def moment_program(ranged: Ranged, box: EnclosingBox, cost: float) -> MomentProgram:
+    """Return the data of the relaxation; arguments as in `moment_bound`."""
+    # errors in units of the largest error of a point with this cost: together with the box, every monomial is at most
+    # one
+    unit = np.sqrt(cost * np.diag(ranged.spread))
+    cone, rule, white = _forms(ranged, box, unit)
+    form = white.T @ white
+    size = float(np.abs(form).max())
+    values = {
+        "cost": _upper(form / size),
+        "cone": _upper(cone / np.abs(cone).max()),
+        "rule": rule / np.abs(rule).max(1, keepdims=True),
+    }
+    return MomentProgram(values, size, white, box)
 
 
 def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str = "CLARABEL") -> Bounded:
@@ -194,28 +239,18 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
     Lasserre (2001).
     """
     M, d = ranged.station.shape
-    own = moments(M, d)
-    # errors in units of the largest error of a point with this cost: together with the box, every monomial is at most
-    # one
-    unit = np.sqrt(cost * np.diag(ranged.spread))
-    cone, rule, form = _forms(ranged, box, unit)
-    size = float(np.abs(form).max())
-    values = {
-        "cost": _upper(form / size),
-        "cone": _upper(cone / np.abs(cone).max()),
-        "rule": rule / np.abs(rule).max(1, keepdims=True),
-    }
+    own, program = moments(M, d), moment_program(ranged, box, cost)
     # no monomial of a relevant point exceeds one
-    answer = _relaxation(M, d, backend).solve(values, reach=float(np.sqrt(own.count)))
+    answer = _relaxation(M, d, backend).solve(program.values, reach=float(np.sqrt(own.count)))
     place = answer.values["y"][own.table[:, :, 0, 0]]
-    point = box.centre + box.axes @ place[0, 1:-1]
+    point, size = box.centre + box.axes @ place[0, 1:-1], program.size
     return Bounded(point, answer.primal * size, min(answer.bound * size, cost), rank_ratio(place), answer)
 
 
 def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array, Array]:
-    """Return the coefficients of the relaxation: first equality, other equalities, and cost.
+    """Return the coefficients of the relaxation: first equality, other equalities, and whitened residuals.
 
-    The first equality is a matrix in (1, s, t), the cost a matrix in (1, t, omega). The others are rows (M - 1, d + 5)
+    The first equality is a matrix in (1, s, t), the residuals are linear in (1, t, omega). The others are rows (M - 1, d + 5)
     of ``1, s, t, w_i, t w_i, w_i^2``. `unit` (M - 1,) are the units of the errors w.
     """
     from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]
@@ -239,20 +274,20 @@ def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array
     # from (1, t, omega) to (1, r_1, w)
     change = np.diag(np.concatenate([[1.0, half], unit]))
     change[1, 0] = middle
-    return cone, rule, _cost(ranged, change)
+    return cone, rule, _white(ranged, change)
 
 
-def _cost(ranged: Ranged, change: Array) -> Array:
-    """Return the matrix of the cost after a change of the variables (1, r_1, w).
+def _white(ranged: Ranged, change: Array) -> Array:
+    """Return the whitened residuals as rows in the variables (1, t, omega), whose sum of squares is the cost.
 
     `change` maps (1, t, omega) to (1, r_1, w).
     """
     if ranged.free:
-        return np.asarray(change[2:].T @ np.linalg.solve(ranged.spread, change[2:]))
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(ranged.spread), change[2:]))
     # The measurement minus the middle of the box is small. It is subtracted before squaring, because squares of ranges
     # in standard deviations have eight digits more than the cost.
     error = -ranged.offset[0] * np.eye(1, len(change)) + change[1] + np.pad(change[2:], ((1, 0), (0, 0)))
-    return np.asarray(error.T @ np.linalg.solve(ranged.covariance, error))
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(ranged.covariance), error))
 
 
 def _upper(form: Array) -> Array:

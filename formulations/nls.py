@@ -29,6 +29,8 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
 from formulations.backend import Choice, Ending, SolverError, count, first_sentence, hold_in_forks, record
+from formulations.nonlinear_solvers import nonlinear_report, status_of
+from formulations.solver_report import SolverReport
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
@@ -80,6 +82,8 @@ class Local:
         True if the solver met its tolerances, the point satisfies the constraints and the cost has a gradient there.
     iterations : int
         Interior-point iterations.
+    report : SolverReport
+        The solver's report; only IPOPT and Uno pass on their residuals.
     """
 
     x: Array
@@ -90,6 +94,38 @@ class Local:
     status: str
     success: bool
     iterations: int
+    report: SolverReport
+
+
+@dataclass(frozen=True, slots=True)
+class NonlinearStatement:
+    """A nonlinear program as expressions of CasADi.
+
+    Parameters
+    ----------
+    x, p : casadi.SX
+        Unknowns (n, 1), and all numbers that change between solves.
+    f : casadi.SX
+        Cost.
+    equalities, inequalities : casadi.SX
+        Columns c and d of ``c = 0`` and ``d >= 0``.
+    white : casadi.SX
+        Residuals (m, 1) in standard deviations.
+    """
+
+    x: Any
+    p: Any
+    f: Any
+    equalities: Any
+    inequalities: Any
+    white: Any
+
+    @property
+    def g(self) -> Any:
+        """Return the column of all constraints, the equalities first."""
+        import casadi as ca
+
+        return ca.vertcat(self.equalities, self.inequalities)
 
 
 class Program:
@@ -139,30 +175,53 @@ class Program:
         choice: Choice | None = None,
         compiled: bool = False,
     ) -> None:
-        import casadi as ca
-
         if (h is None) == (residual is None):
             raise ValueError("give either h or residual")
         self.n, self.m, self.p, self.diagonal = n, m, p, diagonal
-        x, given, z = ca.SX.sym("x", n), ca.SX.sym("p", p), ca.SX.sym("z", m)
-        weight = ca.SX.sym("W", m, 1 if diagonal else m)
-        mean, information = ca.SX.sym("mean", n), ca.SX.sym("M", n, n)
-        misfit = z - _column(h(x, given), m) if h is not None else _column(residual(x, given, z), m)  # type: ignore[misc]
-        c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
-        d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
-        # common subexpressions are computed once: derivatives of courses over ground then have a seventh of the length
-        misfit, c, d = ca.cse([misfit, c, d])
-        white = weight * misfit if diagonal else weight @ misfit
-        cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
-        cost += 0.0 if penalty is None else penalty(x, given)
-        self._equal, self._more = c.shape[0], d.shape[0]
-        # one parameter vector contains all numbers that change between solves, so the program is built and compiled
-        # once
-        data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))
-        program = {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)}
+        given = (lambda x, p, z: z - _column(h(x, p), m)) if h is not None else residual
+        assert given is not None
+        self._prepare(_state(self, given, penalty, equalities, inequalities), choice, settings or {}, compiled)
+
+    @classmethod
+    def of(
+        cls,
+        program: Program,
+        statement: NonlinearStatement,
+        *,
+        choice: Choice | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Program:
+        """Return a program with another cost or more constraints, and the numbers of an earlier program.
+
+        Parameters
+        ----------
+        program : Program
+            The earlier program: sizes, and the order of the numbers p.
+        statement : NonlinearStatement
+            Expressions in the symbols x and p of its statement.
+        choice : Choice, optional
+            Another nonlinear solver of CasADi with its settings.
+        settings : Mapping[str, Any], optional
+            IPOPT settings.
+        """
+        changed = cls.__new__(cls)
+        changed.n, changed.m, changed.p, changed.diagonal = program.n, program.m, program.p, program.diagonal
+        changed._prepare(statement, choice, settings or {}, compiled=False)
+        return changed
+
+    def _prepare(
+        self, statement: NonlinearStatement, choice: Choice | None, settings: Mapping[str, Any], compiled: bool
+    ) -> None:
+        """Build the solver of a statement; arguments as in the class."""
+        import casadi as ca
+
+        self.statement, x, data = statement, statement.x, statement.p
+        self._equal, self._more = statement.equalities.shape[0], statement.inequalities.shape[0]
+        program = {"x": x, "p": data, "f": statement.f, "g": statement.g}
         self._name = "ipopt" if choice is None else choice.name
-        options = _options(choice, settings or {})
-        self._check = ca.Function("check", [x, data], [ca.gradient(cost, x), ca.vertcat(c, ca.fmin(d, 0.0))])
+        options = _options(choice, settings)
+        broken = ca.vertcat(statement.equalities, ca.fmin(statement.inequalities, 0.0))
+        self._check = ca.Function("check", [x, data], [ca.gradient(statement.f, x), broken])
         solver = ca.nlpsol("nls", self._name, program, options)
         faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
@@ -171,6 +230,26 @@ class Program:
         # would corrupt, and one report of its last solve.
         self.lock = threading.Lock()
         _LOCKS.programs.add(self)
+
+    def data(
+        self,
+        z: ArrayLike,
+        weight: ArrayLike | None = None,
+        p: ArrayLike = (),
+        prior: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> Array:
+        """Return the numbers of the symbols p of the statement; arguments as in `solve`."""
+        identity = np.ones(self.m) if self.diagonal else np.eye(self.m)
+        mean, information = prior if prior is not None else (np.zeros(self.n), np.zeros((self.n, self.n)))
+        return np.concatenate(
+            [
+                _check("p", p, (self.p,)),
+                _check("z", z, (self.m,)),
+                _check("weight", identity if weight is None else weight, identity.shape).ravel(order="F"),
+                _check("prior mean", mean, (self.n,)),
+                _check("prior information", information, (self.n, self.n)).ravel(order="F"),
+            ]
+        )
 
     def solve(
         self,
@@ -182,6 +261,7 @@ class Program:
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
         prior: tuple[ArrayLike, ArrayLike] | None = None,
+        multipliers: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> Local:
         """Return a local solution for new data.
 
@@ -199,35 +279,32 @@ class Program:
             Bounds; infinite if absent.
         prior : pair of array_like, shapes (n,) and (n, n), optional
             Mean m and information matrix M.
+        multipliers : pair of array_like, shapes (n,) and (constraints,), optional
+            First multipliers of the bounds, and of equalities and inequalities, with the signs of `Local`; zeros if
+            absent. They help a solver that starts warm.
 
         Returns
         -------
         Local
             A local minimiser, or the last iterate and the reason of the failure.
         """
-        identity = np.ones(self.m) if self.diagonal else np.eye(self.m)
-        mean, information = prior if prior is not None else (np.zeros(self.n), np.zeros((self.n, self.n)))
-        data = np.concatenate(
-            [
-                _check("p", p, (self.p,)),
-                _check("z", z, (self.m,)),
-                _check("weight", identity if weight is None else weight, identity.shape).ravel(order="F"),
-                _check("prior mean", mean, (self.n,)),
-                _check("prior information", information, (self.n, self.n)).ravel(order="F"),
-            ]
-        )
+        data = self.data(z, weight, p, prior)
+        constraints = self._equal + self._more
+        first, second = multipliers if multipliers is not None else (np.zeros(self.n), np.zeros(constraints))
         given = {
             "x0": _check("start", start, (self.n,)),
             "p": data,
             "lbx": _check("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
             "ubx": _check("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
-            "lbg": np.zeros(self._equal + self._more),
+            "lam_x0": _check("multipliers of bounds", first, (self.n,)),
+            "lam_g0": _check("multipliers", second, (constraints,)),
+            "lbg": np.zeros(constraints),
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
         try:
             with self.lock:
                 found, stats = self._solver(**given), self._solver.stats()
-            status = str(stats["return_status"])
+            status = status_of(stats)
         except RuntimeError as trouble:  # CasADi raises no other type
             record(Ending(self._name, "error", first_sentence(trouble), found=False))
             raise SolverError(f"{self._name} failed: {trouble}") from trouble
@@ -250,6 +327,7 @@ class Program:
             status=status,
             success=success,
             iterations=iterations,
+            report=nonlinear_report(self._name, stats, status, success=success),
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:
@@ -264,6 +342,33 @@ class Program:
         if not np.isfinite(slope).all():
             return "the cost has no gradient at this point"
         return "" if np.abs(broken).max(initial=0.0) <= _BROKEN else "the constraints are not met"
+
+
+def _state(
+    program: Program,
+    residual: Residual,
+    penalty: Function | None,
+    equalities: Function | None,
+    inequalities: Function | None,
+) -> NonlinearStatement:
+    """Return the expressions of a program of the given size; the functions are as in `Program`."""
+    import casadi as ca
+
+    n, m = program.n, program.m
+    x, given, z = ca.SX.sym("x", n), ca.SX.sym("p", program.p), ca.SX.sym("z", m)
+    weight = ca.SX.sym("W", m, 1 if program.diagonal else m)
+    mean, information = ca.SX.sym("mean", n), ca.SX.sym("M", n, n)
+    misfit = _column(residual(x, given, z), m)
+    c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
+    d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
+    # common subexpressions are computed once: derivatives of courses over ground then have a seventh of the length
+    misfit, c, d = ca.cse([misfit, c, d])
+    white = weight * misfit if program.diagonal else weight @ misfit
+    cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
+    cost += 0.0 if penalty is None else penalty(x, given)
+    # one parameter vector contains all numbers that change between solves, so the program is built and compiled once
+    data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))
+    return NonlinearStatement(x, data, cost, c, d, white)
 
 
 class _Locks:

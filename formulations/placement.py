@@ -122,23 +122,35 @@ def gradients(design: Design, w: Array, criterion: Criterion) -> tuple[Array, Ar
     return of_places(covariance, criterion), -np.einsum("prdn,pde,pren->pn", c, turn, c)
 
 
-def semidefinite(
+def semidefinite_problem(
     design: Design, rules: Array, limits: Array, criterion: Criterion, *, worst: bool = False
-) -> tuple[float, Array]:
-    """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
+) -> tuple[Any, Any]:
+    """Build the semidefinite relaxation as a cvxpy problem.
 
-    The value is a lower bound for all sets of sites. `rules` (R, n) and `limits` (R,) are the linear rules; `worst`
-    minimises the maximum over places instead of their mean.
+    Parameters
+    ----------
+    design : Design
+        Sites and places.
+    rules, limits : Array, shapes (R, n), (R,)
+        rules @ w <= limits.
+    criterion, worst
+        As in `value`.
 
-    Raises
-    ------
-    SolverError
-        If the back end has no solution.
+    Returns
+    -------
+    problem : cvxpy.Problem
+        Variable ``weights`` (n,) is w.
+    each : cvxpy.Expression, shape (P,)
+        The criterion at each place.
+
+    Notes
+    -----
+    Joshi and Boyd (2009); see the text of the module.
     """
     import cvxpy as cp
 
     places, _, m, n = design.rows.shape
-    d, w = design.dimension, cp.Variable(n)
+    d, w = design.dimension, cp.Variable(n, name="weights")
     bounds = [w >= 0, w <= 1, rules @ w <= limits]
     parts = []
     for p in range(places):
@@ -163,14 +175,32 @@ def semidefinite(
             parts.append(cp.inv_pos(least))
             bounds.append(information - least * (pick @ pick.T) >> 0)
     each = cp.hstack(parts)
-    problem = cp.Problem(cp.Minimize(cp.max(each) if worst else design.weight @ each), bounds)
+    return cp.Problem(cp.Minimize(cp.max(each) if worst else design.weight @ each), bounds), each
+
+
+def semidefinite(
+    design: Design, rules: Array, limits: Array, criterion: Criterion, *, worst: bool = False
+) -> tuple[float, Array]:
+    """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
+
+    The value is a lower bound for all sets of sites. `rules` (R, n) and `limits` (R,) are the linear rules; `worst`
+    minimises the maximum over places instead of their mean.
+
+    Raises
+    ------
+    SolverError
+        If the back end has no solution.
+    """
+    import cvxpy as cp
+
+    problem, _ = semidefinite_problem(design, rules, limits, criterion, worst=worst)
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
         raise SolverError(f"Clarabel failed: {first_sentence(error)}") from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise SolverError(f"Clarabel ended with {problem.status}")
-    return float(problem.value), np.asarray(w.value)
+    return float(problem.value), np.asarray(next(v.value for v in problem.variables() if v.name() == "weights"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ import numpy as np
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.range_height import Ellipsoid, HeightCurve, three_stations
+from formulations.solver_report import SolverReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +75,60 @@ def lifted_problem() -> Any:
 @keep
 def _relaxation(backend: str) -> Relaxation:
     """Return the relaxation, built once for each back end."""
-    # a tenth of a millimetre in Earth radii; a matrix of size three allows this tolerance
-    return Relaxation(lifted_problem(), backend=backend, settings=tight(backend, 1e-11))
+    return Relaxation(lifted_problem(), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the relaxation for a back end.
+
+    The tolerance is a tenth of a millimetre in Earth radii, which a matrix of size three allows.
+    """
+    return tight(backend, 1e-11)
+
+
+@dataclass(frozen=True, slots=True)
+class HeightProgram:
+    """The data of the relaxation.
+
+    Parameters
+    ----------
+    curve : HeightCurve
+        The points that fit the ranges.
+    change : Array, shape (3, 3)
+        Map from the scaled variables of the lift to (1, t, mu).
+    values : dict of str to Array
+        Parameters of `lifted_problem`.
+    size : float
+        The squared distance is `size` times the objective.
+    longest : float
+        Greatest length of the lift of any point of the ellipsoid.
+    """
+
+    curve: HeightCurve
+    change: Array
+    values: dict[str, Array]
+    size: float
+    longest: float
+
+    @property
+    def places(self) -> Array:
+        """Return the matrix (3, 3) that maps the first column of the lift to the position."""
+        return np.stack([self.curve.base[0], self.curve.along[0], self.curve.across[0]], axis=1) @ self.change
+
+
+def height_program(
+    stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array
+) -> HeightProgram | None:
+    """Return the data of the relaxation, or None if the ranges give no curve; arguments as in `lift`."""
+    curve = three_stations(stations[None], np.asarray(sign, dtype=np.float64)[None], offset[None])
+    guess = float(np.linalg.norm(near - stations[0]))
+    forms, change = _forms(curve, surface, near, guess)
+    if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
+        return None
+    # each form is divided by its largest entry, which an equality allows; the bound is multiplied by it again
+    scale = float(np.abs(forms["objective"]).max())
+    data = {name: form / np.abs(form).max() for name, form in forms.items()}
+    return HeightProgram(curve, change, data, scale, _reach(curve, stations[0], surface, guess))
 
 
 def lift(
@@ -105,20 +158,16 @@ def lift(
     -----
     Shor (1987) after the elimination of the ranges.
     """
-    curve = three_stations(stations[None], np.asarray(sign, dtype=np.float64)[None], offset[None])
-    guess = float(np.linalg.norm(near - stations[0]))
-    forms, change = _forms(curve, surface, near, guess)
-    if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
-        nothing = ConicAnswer({}, np.nan, -np.inf, "not formulated", solved=False, iterations=0)
+    program = height_program(stations, sign, offset, surface, near)
+    if program is None:
+        status = "not formulated"
+        nothing = ConicAnswer({}, np.nan, -np.inf, status, False, 0, SolverReport(backend, status))
         return LiftedHeights(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
-    # each form is divided by its largest entry, which an equality allows; the bound is multiplied by it again
-    scale = float(np.abs(forms["objective"]).max())
-    data = {name: form / np.abs(form).max() for name, form in forms.items()}
-    answer = _relaxation(backend).solve(data, reach=_reach(curve, stations[0], surface, guess))
-    lift = answer.values["lift"]
-    _, t, mu = change @ lift[:, 0]
+    answer = _relaxation(backend).solve(program.values, reach=program.longest)
+    lift, curve = answer.values["lift"], program.curve
+    _, t, mu = program.change @ lift[:, 0]
     x = curve.points(np.array([[t]]), np.array([[mu]]))[0, 0]
-    return LiftedHeights(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, rank_ratio(lift), answer)
+    return LiftedHeights(x, curve.rate[0] * t + curve.offset[0], answer.bound * program.size, rank_ratio(lift), answer)
 
 
 def _forms(curve: HeightCurve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:

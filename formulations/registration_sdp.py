@@ -47,6 +47,7 @@ reason are this project's.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,10 +152,9 @@ def registration(
     run = RegistrationWindows.of(station, z, whiten, sigma, design, mean, time)
     if not run.finite:
         return ()
-    # the price of the mean of |p_k|^2 over the windows
     K, S, d = run.station.shape
-    relaxation, data = _relaxation(K, S, d, run.power.shape[1] - 1, len(run.prior), backend), _parameters(run)
-    weight = np.kron(run.power.T @ run.power / K, np.eye(d))
+    relaxation, data = _relaxation(K, S, d, run.power.shape[1] - 1, len(run.prior), backend), run.parameters()
+    weight = run.weight
     found = []
     for price in prices:
         answer = relaxation.solve({**data, "price": price * weight}, bound=False)
@@ -258,6 +258,19 @@ class RegistrationWindows:
             found[0] -= self.clock[0] * found[1]
         found[0] += self.origin
         return np.asarray(found)
+
+    @property
+    def weight(self) -> Array:
+        """Return the form (n, n) of the mean of |p_k|^2 over the windows, which the price multiplies."""
+        return np.kron(self.power.T @ self.power / len(self.station), np.eye(len(self.origin)))
+
+    def bias(self, shift: Any) -> Any:
+        """Return the biases (b,) in the units of the caller from scaled shifts, an array or an expression."""
+        return self.mean + self.unit * self.scale * shift
+
+    def parameters(self) -> dict[str, Array]:
+        """Return the parameters of `registration_problem` by name, except the price."""
+        return _parameters(self)
 
     @property
     def total(self) -> Array:
@@ -364,17 +377,30 @@ def _read_off(run: RegistrationWindows, weight: Array, price: float, answer: Con
     square = float((weight * shared[inside, inside]).sum())
     return RegistrationStart(
         run.place(target),
-        run.mean + run.unit * run.scale * shift,
+        run.bias(shift),
         cost,
         price,
         answer.primal - price * square,
         run.scale**2 * (square - float(target @ weight @ target)),
-        max(rank_ratio(_block(answer, k)) for k in range(len(run.station))),
+        largest_rank_ratio(answer.values, len(run.station)),
         answer,
     )
 
 
-def _block(answer: ConicAnswer, window: int) -> Array:
+def largest_rank_ratio(values: Mapping[str, Array], windows: int) -> float:
+    """Return the second over the first eigenvalue of the block in which it is largest.
+
+    Parameters
+    ----------
+    values : mapping of str to Array
+        Variables of `registration_problem` by name.
+    windows : int
+        K.
+    """
+    return max(rank_ratio(_block(values, k)) for k in range(windows))
+
+
+def _block(values: Mapping[str, Array], window: int) -> Array:
     """Return the block of a window from a solution of the relaxation: the lift of (1, p, v, delta, r_1, f)."""
-    across = answer.values[f"across {window}"]
-    return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])
+    across = values[f"across {window}"]
+    return np.block([[values["shared"], across], [across.T, values[f"own {window}"]]])

@@ -136,8 +136,15 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
 @keep
 def _relaxation(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
     """Return the relaxation, built once for each structure and back end."""
-    # the size distinguishes errors within a threshold from exact zeros: two decades below Clarabel's default tolerance
-    return Relaxation(sparse_problem(n, groups, cones), backend=backend, settings=tight(backend, 1e-10))
+    return Relaxation(sparse_problem(n, groups, cones), backend=backend, settings=settings_of(backend))
+
+
+def settings_of(backend: str = "CLARABEL") -> dict[str, float]:
+    """Return the settings of the programme for a back end: two decades below Clarabel's default tolerance.
+
+    The size of an error then distinguishes errors within a threshold from exact zeros.
+    """
+    return tight(backend, 1e-10)
 
 
 def sparse_fit(
@@ -186,17 +193,66 @@ def sparse_fit(
     """
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     m, n = B.shape
+    program = sparse_program(B, g, groups, price=price, cones=cones)
+    if program is None:
+        return SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, -np.inf, None)
+    scale = program.scale
+    answer = _relaxation(*program.structure, backend).solve(program.values, bound=bound)
+    if not np.isfinite(answer.primal):
+        return SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, answer.bound * scale**2, answer)
+    y = program.centre + program.back @ answer.values["y"]
+    # in closed form at the solution y: exact zeros, while the errors in the solver's solution are only small
+    errors = shrink(B @ y - g, program.member, program.price)
+    rest = B @ y - g - errors
+    value = 0.5 * float(rest @ rest) + float(program.price @ group_sizes(errors, program.member, len(program.price)))
+    return SparseFit(y, errors, value, answer.bound * scale**2, answer)
+
+
+@dataclass(frozen=True, slots=True)
+class SparseProgram:
+    """The data of one programme.
+
+    Parameters
+    ----------
+    structure : tuple
+        Arguments of `sparse_problem`.
+    values : dict of str to Array
+        Its parameters.
+    centre, back : Array, shapes (n,) and (n, n)
+        The unknowns are ``centre + back z`` with the variable z of the programme.
+    scale : float
+        Unit of the residuals and errors of the programme, sigmas. The cost is its square times the objective.
+    member, price : int array (m,) and Array (G,)
+        Group of each row, and thresholds.
+    """
+
+    structure: tuple[int, tuple[int, ...], tuple[int, ...]]
+    values: dict[str, Array]
+    centre: Array
+    back: Array
+    scale: float
+    member: Groups
+    price: Array
+
+
+def sparse_program(
+    B: Array, g: Array, groups: Groups | None = None, *, price: Array | None = None, cones: Sequence[Array] = ()
+) -> SparseProgram | None:
+    """Return the data of a programme; None if a number is not finite or the rows leave a direction undetermined.
+
+    The arguments and the error are those of `sparse_fit`.
+    """
+    m, n = B.shape
     member = np.arange(m) if groups is None else np.asarray(groups)
     if g.shape != (m,) or member.shape != (m,) or any(c.shape[1] != n + 1 for c in cones):
         raise ValueError(f"rows {B.shape}, right sides {g.shape}, groups {member.shape} and cones do not fit")
     present = np.asarray((B != 0.0).any(axis=1))
     price = thresholds(np.bincount(member, weights=present).astype(np.intp)) if price is None else price
-    nothing = SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, -np.inf, None)
     if m < n or not (np.isfinite(B).all() and np.isfinite(g).all()):
-        return nothing
+        return None
     left, size, across = np.linalg.svd(B, full_matrices=False)
     if size[-1] <= _RANK * size[0]:
-        return nothing
+        return None
     # y = centre + back z, with the least-squares fit at the centre
     back, centre = across.T / size, (across.T / size) @ (left.T @ g)
     off = g - B @ centre
@@ -206,15 +262,7 @@ def sparse_fit(
         moved = np.concatenate([given[:, :n] @ back, (given[:, :n] @ centre + given[:, n])[:, None] / scale], axis=1)
         values[f"cone {k}"] = moved / np.abs(moved).max()  # a cone may be multiplied by a factor
     structure = (n, tuple(member.tolist()), tuple(len(c) - 1 for c in cones))
-    answer = _relaxation(*structure, backend).solve(values, bound=bound)
-    if not np.isfinite(answer.primal):
-        return SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, answer.bound * scale**2, answer)
-    y = centre + back @ (scale * answer.values["y"])
-    # in closed form at the solution y: exact zeros, while the errors in the solver's solution are only small
-    errors = shrink(B @ y - g, member, price)
-    rest = B @ y - g - errors
-    value = 0.5 * float(rest @ rest) + float(price @ group_sizes(errors, member, len(price)))
-    return SparseFit(y, errors, value, answer.bound * scale**2, answer)
+    return SparseProgram(structure, values, centre, scale * back, scale, member, price)
 
 
 def group_sizes(values: Array, groups: Groups, count: int) -> Array:

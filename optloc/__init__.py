@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from optloc.sites.calibration.calibrated import calibrate as calibrate
     from optloc.sites.placement.chosen import place as place
     from optloc.solvers.certificates.admitted import certify as certify
+    from optloc.solvers.posing.choose_formulation import pose as pose
     from optloc.solvers.prepared import prepare as prepare
     from optloc.solvers.solution import solve as solve
     from optloc.tracking.run import track as track

@@ -206,7 +206,7 @@ def test_a_module_with_functions_has_its_test_in_the_mirrored_folder():
 
 # Words with one meaning, and the module that may define them: the plan of the engine, and the function that returns a
 # problem of optimisation.
-RESERVED = {"Plan": "optloc.engine", "pose": "optloc.pose"}
+RESERVED = {"Plan": "optloc.engine", "pose": "optloc.solvers.posing"}
 
 
 def test_reserved_words_are_defined_in_one_place():

@@ -21,6 +21,7 @@ from optloc.problem.claims import Claims
 from optloc.problem.determined import Determined
 from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout
+from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.problem.state_order import components, in_order
 
@@ -153,6 +154,8 @@ class Fix:
         Greatest distance, metres, of a station from the mean of the stations; also of a target without a chart.
     labels : array (...), optional
         Labels of the fixes, such as the index of the data frame with their measurements.
+    posed : PosedAnswer, optional
+        Values, duals and solver report of a single fix from `optloc.pose`; None for other fixes.
     source : object array (...), optional
         A `Source` for `determined`; None for fixes with status `ok`, and in batches where many fixes have another
         status.
@@ -179,6 +182,7 @@ class Fix:
     reach: Annotated[Array, Axes(0)] | None = None
     source: Annotated[Array, Axes(0, empty=None)] | None = None
     labels: Annotated[Array, Axes(0, empty=None)] | None = None
+    posed: PosedAnswer | None = None
     # Cached at the first use, because a program can read one certificate after the other.
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 

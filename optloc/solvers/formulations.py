@@ -14,10 +14,19 @@ from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
+from optloc.solvers.posing.gross_errors import pose_sparse
+from optloc.solvers.posing.moving_stations import pose_doppler, pose_registration
+from optloc.solvers.posing.programs import pose_program
+from optloc.solvers.posing.range_moments import pose_heights, pose_lifted, pose_moments
+from optloc.solvers.posing.sight_lines import pose_directions, pose_minimax
+from optloc.solvers.posing.squared_ranges import pose_hull, pose_shor
+from optloc.solvers.posing.statement import ConicStatement, Locate
+from optloc.solvers.scaled_program import ScaledProblem
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.doppler import doppler_starts, has_doppler_of_rest
 from optloc.solvers.starts.position import height_starts, is_registration_run, over_ground, squared_range_starts
-from optloc.solvers.starts.registration import closed_form, relax_run, run_starts
+from optloc.solvers.starts.registration import closed_form, run_starts
+from optloc.solvers.starts.registration_windows import relax_run
 from optloc.solvers.starts.squared_range import hull, minimum, shor, stationary_points
 
 
@@ -63,6 +72,8 @@ class Formulation:
     bound: Callable[[Problem, Fix], Reference] | None = None
     words: tuple[str, ...] = ()
     needs: Callable[[Problem], str] = lambda problem: ""
+    pose: Callable[[Problem, Locate], ConicStatement | ScaledProblem] | None = None
+    twin: str = ""
 
 
 def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
@@ -128,6 +139,7 @@ _PROGRAMS: dict[str, Formulation] = {
             "gtrs": partial(squared_range_starts, pick=minimum),
             "roots": partial(squared_range_starts, pick=stationary_points),
         },
+        twin="squared_range_conic: shor",
     ),
     "squared_range_conic: shor": Formulation(
         "semidefinite twin of the same problem",
@@ -136,6 +148,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.5 ms",
         "Shor 1987",
         starts={"sdp": partial(squared_range_starts, pick=shor)},
+        pose=pose_shor,
     ),
     "squared_range_conic: hull": Formulation(
         "second-order cone relaxation |x| <= r of the same problem",
@@ -144,6 +157,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.2 ms",
         "convex hull of the cone",
         starts={"socp": partial(squared_range_starts, pick=hull)},
+        pose=pose_hull,
     ),
     "sparse_errors": Formulation(
         "linear rows with a few gross errors, whose sizes are penalised, on the cones of the ranges",
@@ -152,6 +166,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "1 ms",
         "Donoho, Johnstone 1994; Yuan, Lin 2006; She, Owen 2011",
         words=("sparse",),
+        pose=pose_sparse,
     ),
     "range_height": Formulation(
         "ranges with one common unknown, on an ellipsoid: a quartic, with horizon",
@@ -161,6 +176,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Ho, Chan 1997, exact for the ellipsoid",
         serves=over_ground,
         starts={"gtrs": height_starts, "roots": height_starts, "socp": height_starts},
+        twin="range_height_conic",
     ),
     "range_height_conic": Formulation(
         "3 x 3 lift after elimination of the range differences, nearest to the subsatellite point",
@@ -170,6 +186,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Shor 1987",
         serves=over_ground,
         starts={"sdp": partial(height_starts, relax=True)},
+        pose=pose_heights,
     ),
     "bearing_ls": Formulation(
         "pseudo-linear least squares of angles, weighted, with an instrumental-variable pass",
@@ -179,6 +196,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Dogancay 2006, 2015",
         starts={"wiv": _from_bearings(instrumental)},
         needs=_needs_sight,
+        twin="direction_sdp",
     ),
     "bearing_course": Formulation(
         "the same for a target on a polynomial course, over all epochs; one turning station may be enough",
@@ -187,6 +205,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.5 ms for 100 angles",
         "Dogancay 2006, 2015",
         words=("gtrs", "roots", "wiv"),
+        twin="nls",
     ),
     "direction_sdp": Formulation(
         "lifted unit directions that meet in a point; with a minorant a lower bound of the angular cost",
@@ -198,6 +217,7 @@ _PROGRAMS: dict[str, Formulation] = {
         bound=partial(reference_bound, method="directions"),
         words=("bound",),
         needs=_needs_directions,
+        pose=pose_directions,
     ),
     "moment_sdp": Formulation(
         "order-2 moments of position and range errors in a box: a lower bound of the maximum-likelihood cost",
@@ -207,6 +227,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Lasserre 2001",
         bound=partial(reference_bound, method="moment"),
         words=("bound",),
+        pose=pose_moments,
     ),
     "minimax_cone": Formulation(
         "smallest maximal angle, by bisection over second-order cones; proves contradictions of bounds",
@@ -216,6 +237,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Kahl, Hartley 2008",
         starts={"minimax": _from_bearings(least_worst)},
         needs=_needs_bearings,
+        pose=pose_minimax,
     ),
     "bistatic": Formulation(
         "closed-form range of one receiver and one illuminator; polynomial course of several epochs",
@@ -224,6 +246,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "50 us",
         "Skolnik 1961",
         words=("gtrs", "roots"),
+        twin="nls",
     ),
     "registration": Formulation(
         "position, course and biases of a run: reference ranges projected out, then linked to the lifted course",
@@ -233,6 +256,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Chan, Ho 1994; Beck, Stoica, Li 2008",
         serves=is_registration_run,
         starts={"gtrs": _start_run, "roots": _start_run, "socp": _start_run},
+        twin="registration_sdp",
     ),
     "registration_sdp": Formulation(
         "the same, lifted with its reference ranges; penalty on the trace, prior on the biases",
@@ -242,6 +266,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Shor 1987",
         serves=is_registration_run,
         starts={"sdp": _start_relaxed_run},
+        pose=pose_registration,
     ),
     "doppler_sdp": Formulation(
         "position, ranges, unknown rates and their products, lifted; weighted by the ranges of the pass before",
@@ -251,6 +276,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "Song et al. 2025; Wang, Li, Ansari 2013",
         serves=has_doppler_of_rest,
         starts={"sdp": doppler_starts},
+        pose=pose_doppler,
     ),
     "lifted": Formulation(
         "order-1 lift [1, x, r]: a baseline for studies, never a default",
@@ -258,6 +284,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "never for tdoa: its optimum is zero for any data",
         "2 ms",
         "Shor 1987",
+        pose=pose_lifted,
     ),
     "nuclear_norm": Formulation(
         "times of emission whose centred squared arrivals have the least nuclear norm, then the least truncated one: a "
@@ -274,6 +301,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "2 ms",
         "Waechter, Biegler 2006",
         words=("nlp",),
+        pose=pose_program,
     ),
 }
 

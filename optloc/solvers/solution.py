@@ -51,7 +51,7 @@ def solve(problem: Problem, method: str = "auto", *, start: ArrayLike | None = N
     run = Method.parse(method)
     fix = at_once(problem, run) if start is None else None
     fix = solve_in_stages(problem, run, start, refine=refine) if fix is None else fix
-    return _with_sources(problem, fix)
+    return with_sources(problem, fix)
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None, *, refine: bool = True) -> Fix:
@@ -96,7 +96,7 @@ def _broadcast_start(problem: Problem, start: Any) -> Array:
 _KEPT = 8
 
 
-def _with_sources(problem: Problem, fix: Fix) -> Fix:
+def with_sources(problem: Problem, fix: Fix) -> Fix:
     """Return the fixes; fixes that are not `ok` store their problems for later advice, if there are at most `_KEPT`."""
     if not fix.shape and int(fix.code) == Status.OK:
         return fix

@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from formulations import doppler_sdp
-from formulations.doppler_sdp import DopplerScene, blocks, doppler, doppler_problem, normal_points
+from formulations.doppler_sdp import DopplerScene, doppler, doppler_problem
+from formulations.normal_points import blocks, normal_points
 from formulations.range_height import Ellipsoid, ellipsoid
 
 EARTH = 6371e3

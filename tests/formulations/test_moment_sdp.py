@@ -29,7 +29,8 @@ def test_every_point_is_feasible_and_costs_what_it_costs(kind, d):
     ranged, truth = drawn(rng, kind, 5, d, 1e-2)
     M = len(ranged.station)
     box, unit, own = ball(ranged, truth, 0.7), rng.uniform(0.01, 0.1, M - 1), moments(M, d)
-    cone, rule, form = _forms(ranged, box, unit)
+    cone, rule, white = _forms(ranged, box, unit)
+    form = white.T @ white
     for _ in range(10):
         s = rng.uniform(-0.6, 0.6, d)
         x = box.centre + box.axes @ s

@@ -7,7 +7,8 @@ from verdicts import alone
 from optloc import Motion, Status, assemble, measured, simulate, solve
 from optloc.linear.evaluate import predict
 from optloc.problem.noise import variances
-from optloc.solvers.sparse import row_wise, sparse_errors
+from optloc.solvers.sparse import sparse_errors
+from optloc.solvers.starts.sparse_rows import row_wise
 
 BOX = np.array([10e3, 10e3, 6e3])
 STATIONS = np.random.default_rng(7).uniform(-0.5, 0.5, (12, 3)) * BOX

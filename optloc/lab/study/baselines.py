@@ -50,7 +50,7 @@ from optloc.problem import (
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.restarts import starts_of
-from optloc.solvers import given, judge, judge_points, offer, spread_of
+from optloc.solvers import given, judge, judge_points, offer, range_rows, spread_of
 
 _ASIDE = 0.2
 """Width of the box of random centres, in radii of the array. The random centre misses every station, and its distances
@@ -268,32 +268,13 @@ def lifted_sdp(problem: Problem) -> Fix:
 
         def relax(i: int) -> None:
             """Solve the relaxation of problem i."""
-            K, z = _linear(problem.take(np.array([i])), float(scale[i]))
+            K, z = range_rows(problem.take(np.array([i])), float(scale[i]))
             stations = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
             found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
             position[i, 0] = found.point * scale[i] + centre[i]
 
         map_on_threads(relax, range(size), least=WORTH)
     return judge(problem, offer(problem, vectors(problem, position), None, "lifted-sdp", began))
-
-
-def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
-    """Return whitened rows K (m, s) and values z (m,) of one problem whose rows are sums of ranges.
-
-    The rows are linear in the ranges r (s,) from the stations, in units of `scale` (metres): K r = z.
-    """
-    K, start = np.zeros((one.count, one.stations.count)), 0
-    for rows in one.rows:
-        ends = MODELS[rows.kind].ranges
-        assert ends is not None
-        for index, sign in zip((rows.a, rows.b), ends, strict=True):
-            if sign:
-                K[start + np.arange(rows.count), index] += sign
-        start += rows.count
-    # Values are in units of the scale, like the stations: whitening gives numbers of order one.
-    stacked = np.concatenate([K, one.observed[0][:, None] / scale], axis=1)
-    white = np.concatenate([w.apply(stacked[None])[0] for w in whiten(one.noise, one.weight)])
-    return white[:, :-1] * scale, white[:, -1] * scale
 
 
 # Networks: from random positions, and from the convex start.

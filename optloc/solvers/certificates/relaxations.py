@@ -181,30 +181,16 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
 
     reference, found = _nothing(problem, "moment", ""), ranges(problem_at_rest(problem))
     assert found is not None
-    position = np.broadcast_to(
-        problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
-    )
-    place = position[:, found.epoch, found.station]
+    place = _places(problem, found)
 
     def bounded(i: int) -> None:
-        reference.reason[i] = _declined(found, i, bool(fix.answered[i]))
-        if reference.reason[i]:
+        about = _enclosed(found, place, fix, i, region)
+        if isinstance(about, str):
+            reference.reason[i] = about
             return
-        nodes = _nodes(found, i)
-        centre, spread = centre_and_spread(place[i, nodes])
-        size = float(spread) or 1.0  # stations at one point have no spread, so the unit is a metre
-        scaled = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
-        point = (fix.position[i] - centre) / size
-        cost = float(scaled.cost(point))
-        # the misfit of the rows among themselves, computed without the cancellation of large sums of squares
-        loops = float(fix.cost[i]) - cost
-        if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
-            reference.reason[i] = "the cost of the ranges differs from the cost of the fix"
-            return
-        box = enclosure(scaled, point, cost + _MARGIN)
-        reference.scope[i] = "global" if box is not None else "region"
-        box = box or _region(scaled, region, size)
-        answer = None if box is None else moment_bound(scaled, box, cost + _MARGIN)
+        reference.scope[i], centre, size = about.scope, about.centre, about.size
+        loops, box = about.loops, about.box
+        answer = None if box is None else moment_bound(about.scaled, box, about.cost)
         if answer is None or not np.isfinite(answer.bound):
             reference.scope[i] = ""
             reference.reason[i] = (
@@ -217,6 +203,71 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
 
     map_on_threads(bounded, range(len(place)), least=WORTH)
     return reference
+
+
+@dataclass(frozen=True, slots=True)
+class EnclosedRanges:
+    """The ranges of one problem and the box of all positions with a cost as low as that of its fix.
+
+    Parameters
+    ----------
+    scaled : Ranged
+        Ranges in units of `size` metres, relative to `centre` (d,).
+    box : EnclosingBox or None
+        The box; None if the rows do not bound such positions.
+    cost : float
+        Greatest cost of the positions in the box.
+    loops : float
+        Cost of the misfit of the rows among themselves, which no position changes.
+    scope : "global" or "region"
+        Whether the box contains all such positions.
+    """
+
+    scaled: Ranged
+    box: EnclosingBox | None
+    cost: float
+    loops: float
+    centre: Array
+    size: float
+    scope: str
+
+
+def enclosed_ranges(problem: Problem, fix: Fix, margin: float) -> EnclosedRanges | str:
+    """Return the ranges and the box of a flat batch of one problem, or the reason why there are none.
+
+    The box contains the positions whose chi-square is at most `margin` above that of the fix.
+    """
+    why = _beyond(problem) or _beyond_moments(problem)
+    found = None if why else ranges(problem_at_rest(problem))
+    return why if found is None else _enclosed(found, _places(problem, found), fix, 0, None, margin)
+
+
+def _places(problem: Problem, found: Ranges) -> Array:
+    """Return the positions (N, s, d) of the stations with ranges, metres."""
+    shape = (problem.batch_shape[0], *problem.stations.position.shape[-3:])
+    return np.broadcast_to(problem.stations.position, shape)[:, found.epoch, found.station]
+
+
+def _enclosed(
+    found: Ranges, place: Array, fix: Fix, i: int, region: float | None, margin: float = _MARGIN
+) -> EnclosedRanges | str:
+    """Return the ranges and the box of problem i, or the reason why there are none; `region` is in metres."""
+    why = _declined(found, i, bool(fix.answered[i]))
+    if why:
+        return why
+    nodes = _nodes(found, i)
+    centre, spread = centre_and_spread(place[i, nodes])
+    size = float(spread) or 1.0  # stations at one point have no spread, so the unit is a metre
+    scaled = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
+    point = (fix.position[i] - centre) / size
+    cost = float(scaled.cost(point))
+    # the misfit of the rows among themselves, computed without the cancellation of large sums of squares
+    loops = float(fix.cost[i]) - cost
+    if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
+        return "the cost of the ranges differs from the cost of the fix"
+    box = enclosure(scaled, point, cost + margin)
+    scope = "global" if box is not None else "region"
+    return EnclosedRanges(scaled, box or _region(scaled, region, size), cost + margin, loops, centre, size, scope)
 
 
 def _declined(found: Ranges, i: int, answered: bool) -> str:

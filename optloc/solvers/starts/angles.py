@@ -209,11 +209,28 @@ def by_directions(seen: Bearings) -> Array:
 
     def relax(item: tuple[int, Array]) -> None:
         i, use = item
-        axes = None if seen.axes is None else seen.axes[i, use]
-        out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
+        out[i, 0] = directions(**sights(seen, i, use)).point
 
-    map_on_threads(relax, _complete_bearings(seen), least=WORTH)
+    map_on_threads(relax, complete_bearings(seen), least=WORTH)
     return seen.metres(out)
+
+
+def sights(seen: Bearings, i: int, use: Array) -> dict[str, Array | None]:
+    """Return the arguments of `formulations.direction_sdp.directions` for the bearings `use` (m,) of problem i."""
+    axes = None if seen.axes is None else seen.axes[i, use]
+    angle, sigma = seen.angle[i, use], 1.0 / seen.weight[i, use]
+    return {"angle": angle, "sigma": sigma, "station": seen.station[i, use], "axes": axes}
+
+
+def cones_of(seen: Bearings, i: int) -> tuple[Array, Array, Array] | None:
+    """Return directions and stations (m, d) and scales (m,) of the cones of problem i; None without two bearings."""
+    d = seen.station.shape[-1]
+    use = (seen.weight[i, :, : d - 1] > 0.0).all(-1) & np.isfinite(seen.angle[i]).all(-1)
+    if use.sum() < 2:
+        return None
+    ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
+    # a cone has equal width in all directions, so its half angle is the larger deviation
+    return ahead[i, use], seen.station[i, use], 1.0 / seen.weight[i, use, : d - 1].min(-1)
 
 
 def least_worst(seen: Bearings) -> Array:
@@ -222,14 +239,11 @@ def least_worst(seen: Bearings) -> Array:
 
     d = seen.station.shape[-1]
     out = np.full((len(seen.station), 1, d), np.nan)
-    ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
 
     for i in range(len(out)):  # each is a series of programs of a tenth of a millisecond: too short for threads
-        use = (seen.weight[i, :, : d - 1] > 0.0).all(-1) & np.isfinite(seen.angle[i]).all(-1)
-        if use.sum() > 1:
-            # a cone has equal width in all directions, so its half angle is the larger deviation
-            sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
-            out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
+        cones = cones_of(seen, i)
+        if cones is not None:
+            out[i, 0] = minimax(*cones).point
     return seen.metres(out)
 
 
@@ -256,11 +270,11 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
             sigma = 1.0 / seen.weight[i, use]
             out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
 
-    map_on_threads(bound, _complete_bearings(seen), least=WORTH)
+    map_on_threads(bound, complete_bearings(seen), least=WORTH)
     return out
 
 
-def _complete_bearings(seen: Bearings) -> list[tuple[int, Array]]:
+def complete_bearings(seen: Bearings) -> list[tuple[int, Array]]:
     """Return the problems with at least two complete bearings: pairs of their number and flags (m,) of these bearings.
 
     The list is empty in a plane.

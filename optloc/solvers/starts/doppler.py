@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from formulations.doppler_sdp import SIZE, blocks, doppler, lifted_size, normal_points
+from formulations.doppler_sdp import SIZE, doppler, lifted_size
+from formulations.normal_points import blocks, normal_points
 from formulations.range_height import Ellipsoid, ellipsoid
 from optloc.base.linalg import whitening
 from optloc.base.threads import WORTH, map_on_threads
@@ -54,12 +55,10 @@ def doppler_starts(problem: Problem) -> Array:
     """
     size, d = problem.batch_shape[0], problem.dimension
     position = np.full((size, 1 + 2 * d, d), np.nan)
-    height = known_height(problem) if problem.frame.geodetic and d == 3 else None
-    every = _gather(problem)
+    height, every = _heights(problem), _gather(problem)
 
     def start(i: int) -> None:
-        surface = None if height is None or not np.isfinite(height[i]) else ellipsoid(_AXES, height[i])
-        position[i] = _start(problem, i, every, surface)
+        position[i] = _start(problem, i, every, _surface(height, i))
 
     if len(every.row):
         map_on_threads(start, range(size), least=WORTH)
@@ -147,13 +146,55 @@ def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | N
     The first point is the mean of the relaxation, and the others are around it, the farthest first. `every` are the
     rows of all problems in the relaxation. `surface` is the ellipsoid of a known height, or None.
     """
-    one = problem.take(np.array([i]))
+    scene = _scene(problem.take(np.array([i])), every, surface)
+    if scene is None:
+        return np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
+    found = doppler(**scene.given, surface=surface).point
+    return found if surface is None else problem.frame.from_ecef(found)
+
+
+@dataclass(frozen=True, slots=True)
+class LimitedRows:
+    """The rows of one problem that its relaxation uses.
+
+    Parameters
+    ----------
+    given : dict of str to array
+        Arguments of `formulations.doppler_sdp.doppler`.
+    column : int array (p,)
+        Columns of its linear unknowns in the shared unknowns.
+    surface : Ellipsoid or None
+        The ellipsoid of a known height, Earth-centred as the positions then are.
+    """
+
+    given: dict[str, Array]
+    column: Array
+    surface: Ellipsoid | None
+
+
+def _heights(problem: Problem) -> Array | None:
+    """Return the known heights (N,), metres, or None."""
+    return known_height(problem) if problem.frame.geodetic and problem.dimension == 3 else None
+
+
+def _surface(height: Array | None, i: int) -> Ellipsoid | None:
+    """Return the ellipsoid of the height of problem i, or None without a known height."""
+    return None if height is None or not np.isfinite(height[i]) else ellipsoid(_AXES, height[i])
+
+
+def limited_rows(problem: Problem) -> LimitedRows | None:
+    """Return the rows of a flat batch of one problem for its relaxation; None without usable rates."""
+    every = _gather(problem)
+    return _scene(problem, every, _surface(_heights(problem), 0)) if len(every.row) else None
+
+
+def _scene(one: Problem, every: _DopplerRows, surface: Ellipsoid | None) -> LimitedRows | None:
+    """Return the rows of one problem for its relaxation; the other arguments are as in `_start`."""
     z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
     present = (weight > 0.0) & np.isfinite(z)
     rows, z, weight = every.take(present), z[present], weight[present]
-    nowhere = np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
     if not rows.rates.any():
-        return nowhere
+        return None
     pick, values, sigma = _limit_rows(one, rows, z, weight)
     chosen = rows.take(pick)
     nodes, ranges, rates = _nodes(one, chosen)
@@ -165,9 +206,8 @@ def _start(problem: Problem, i: int, every: _DopplerRows, surface: Ellipsoid | N
         white = np.diag(1.0 / sigma)
     place, speed = _motion_of_nodes(one, nodes, surface is not None)
     used = np.flatnonzero(chosen.design.any(axis=0))
-    design = chosen.design[:, used]
-    found = doppler(place, speed, values, white, ranges=ranges, rates=rates, design=design, surface=surface).point
-    return found if surface is None else problem.frame.from_ecef(found)
+    given = {"place": place, "speed": speed, "z": values, "whiten": white, "ranges": ranges, "rates": rates}
+    return LimitedRows({**given, "design": chosen.design[:, used]}, used, surface)
 
 
 def _limit_rows(problem: Problem, rows: _DopplerRows, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:

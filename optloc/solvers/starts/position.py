@@ -7,6 +7,7 @@ of the problems (`optloc.linear.least_squares_ranges`).
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -186,14 +187,10 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     array (N, q, 3)
         Metres; NaN in empty slots, q = 0 if no height is known.
     """
-    size = problem.batch_shape[0]
-    height = known_height(problem) if problem.frame.geodetic and problem.dimension == 3 else None
-    found = None if height is None else ranges(problem)
-    if height is None or found is None:
-        return np.full((size, 0, problem.dimension), np.nan)
-    position = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
-    place = problem.frame.to_ecef(position[:, found.epoch, found.station]) / WGS84_A
-    surface = ellipsoid(_AXES, height / WGS84_A)
+    scene = _height_scene(problem)
+    if scene is None:
+        return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
+    place, found, surface = scene
     parts = []
     # position and common unknown need three ranges and the height; the position alone needs two known ranges and the
     # height
@@ -202,8 +199,47 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
         method = _relax if relax and count == 3 else _intersect
         parts += [method(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
-        return np.full((size, 0, 3), np.nan)
+        return np.full((problem.batch_shape[0], 0, 3), np.nan)
     return problem.frame.from_ecef(np.concatenate(parts, axis=1) * WGS84_A)
+
+
+def _height_scene(problem: Problem) -> tuple[Array, Ranges, Ellipsoid] | None:
+    """Return stations (N, s, 3) in Earth radii, ranges and ellipsoids of the known heights; None without either."""
+    size = problem.batch_shape[0]
+    height = known_height(problem) if problem.frame.geodetic and problem.dimension == 3 else None
+    found = None if height is None else ranges(problem)
+    if height is None or found is None:
+        return None
+    position = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
+    place = problem.frame.to_ecef(position[:, found.epoch, found.station]) / WGS84_A
+    return place, found, ellipsoid(_AXES, height / WGS84_A)
+
+
+def height_sights(problem: Problem) -> dict[str, Any] | None:
+    """Return the arguments of `formulations.range_height_conic.lift` for the widest three stations of one problem.
+
+    None if no height is known, or if there are no three ranges with a common unknown.
+    """
+    scene = _height_scene(problem)
+    if scene is None:
+        return None
+    place, found, surface = scene
+    mask = found.free & np.isfinite(np.broadcast_to(surface.shape, (len(place), 3, 3))).all((-1, -2))
+    subsets = _subsets(place, found, mask, 3)
+    return _lift_arguments(place, found, subsets[0], surface, 0) if subsets and (subsets[0][0] >= 0).all() else None
+
+
+def _lift_arguments(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, i: int) -> dict[str, Any]:
+    """Return the arguments of `formulations.range_height_conic.lift` for problem i; the others are as in `_relax`."""
+    own = Ellipsoid(
+        np.broadcast_to(surface.shape, (len(place), 3, 3))[i], np.broadcast_to(surface.centre, (len(place), 3))[i]
+    )
+    stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
+    above = stations.mean(0)
+    # stations above the Earth measure targets below them, so of two solutions the one on their side is taken
+    below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
+    sign = found.sign[i, nodes[i]].astype(float)
+    return {"stations": stations, "sign": sign, "offset": offset, "surface": own, "near": below}
 
 
 def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array]:
@@ -243,21 +279,12 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
     from formulations.range_height_conic import lift
 
     out = np.full((len(place), 1, 3), np.nan)
-    whole = Ellipsoid(
-        np.broadcast_to(surface.shape, (len(place), 3, 3)), np.broadcast_to(surface.centre, (len(place), 3))
-    )
+    finite = np.isfinite(np.broadcast_to(surface.shape, (len(place), 3, 3))).all((-1, -2))
 
     def relax(i: int) -> None:
-        ellipsoid_of_one = Ellipsoid(whole.shape[i], whole.centre[i])
-        stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
-        above = stations.mean(0)
-        # stations above the Earth measure targets below them, so of two solutions the one on their side is taken
-        below = ellipsoid_of_one.centre + (above - ellipsoid_of_one.centre) / np.sqrt(
-            ellipsoid_of_one.polar(above, above)
-        )
-        out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, ellipsoid_of_one, below).x
+        out[i, 0] = lift(**_lift_arguments(place, found, nodes, surface, i)).x
 
-    map_on_threads(relax, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
+    map_on_threads(relax, np.flatnonzero(mask & finite).tolist(), least=WORTH)
     return out
 
 

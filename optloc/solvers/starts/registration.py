@@ -130,6 +130,11 @@ def _starts_of_blocks(blocks: Problem, begin: Callable[[Problem], Array | None])
     return x if x is None or steady is blocks else _bend(blocks, steady, x)
 
 
+def steady_blocks(problem: Problem) -> Problem:
+    """Return the block averages of a flat batch of runs, with steady biases, for which `run_starts` begins."""
+    return _straighten(average_blocks(_straighten(problem, local=False), BLOCKS), local=True)
+
+
 def _straighten(problem: Problem, local: bool) -> Problem:
     """Return the problem with offsets and drifts instead of its walks, if `local`, or instead of its splines.
 
@@ -392,12 +397,6 @@ def _map_courses(blocks: Problem, x: Array, maps: Array) -> Array:
 
 # Starts on the block averages: runs of range differences, one target whose state lasts the run, and unknown biases.
 
-# Blocks in the relaxation: the time of a semidefinite program grows steeply with their number.
-_WINDOWS = 6
-# The relaxation needs a prior. Biases without a prior get a deviation of this share of the largest range difference. A
-# wide prior leaves the lifted biases free, and a narrow one shifts the start; only a start depends on it.
-_LOOSE = 1e-2
-
 
 @dataclass(frozen=True, slots=True)
 class RegistrationRun:
@@ -548,53 +547,3 @@ def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
     # zero information is an infinite standard deviation
     with np.errstate(divide="ignore"):
         return mean[column], 1.0 / np.sqrt(information[column])
-
-
-def relax_run(problem: Problem) -> Array | None:
-    """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None if it does not apply.
-
-    It uses a few blocks over the whole run in which every station has a row.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N runs of a few dozen epochs, fixed targets or constant velocity.
-    """
-    from formulations.registration_sdp import registration
-
-    run, order = run_of(problem), problem.motions[0].order
-    if run is None or order > 1 or (run.course.sign < 0).any():
-        return None
-    course = run.course
-    size, d = len(course.offset), problem.dimension
-    station, bias = (np.broadcast_to(a, (size, *a.shape[1:])) for a in (course.station, course.bias))
-    whiten = np.broadcast_to(course.whiten, (size, *course.offset.shape[1:], course.offset.shape[2]))
-    # the offsets are scaled, and so is the loose prior
-    loose = _LOOSE * np.abs(course.offset).max() if course.offset.size else 1.0
-    sigma = np.where(np.isfinite(course.sigma), course.sigma, loose)
-    found: list[list[tuple[Array, Array]]] = []
-    for i in range(size):
-        # blocks in which every station has a row, spread evenly over the run
-        whole = np.flatnonzero((whiten[i] != 0.0).any(-1).all(-1))
-        k = whole[np.unique(np.linspace(0, len(whole) - 1, _WINDOWS).round().astype(int))] if len(whole) else whole
-        time = course.time[k] if order else None
-        answers = (
-            registration(
-                station[i, k],
-                course.offset[i, k],
-                whiten[i, k],
-                sigma,
-                design=bias[i, k[0]],
-                mean=course.mean,
-                time=time,
-            )
-            if len(k) > 1
-            else ()
-        )
-        found.append([(one.target, one.bias) for one in answers])
-    width = max(1, *(len(pairs) for pairs in found))
-    state, delta = np.full((size, width, order + 1, d), np.nan), np.zeros((size, width, len(run.column)))
-    for i, pairs in enumerate(found):
-        for j, (target, bias_of) in enumerate(pairs):
-            state[i, j], delta[i, j] = target, bias_of
-    return place_states(problem, run, state, delta)

@@ -97,13 +97,45 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     Signal Process. 56 (2008), section IV for range differences.
     """
     squared = squared_rows(problem, found)
-    first = _pick(squared, np.ones(squared.ranged_right.shape), None, pick)
-    point = np.where(np.isfinite(first[:, 0]), first[:, 0], 0.0)
-    distance = np.maximum(np.sqrt(((point[:, None, :] - squared.place) ** 2).sum(-1)), _NEAR)
+    first, distance, point = _first_pass(squared, pick)
     second = _pick(squared, distance, point, pick)
     # the two weightings have different stationary points; for a single point the second weighting is enough
     points = np.concatenate([second, first], axis=1) if pick is stationary_points else second
     return points * squared.scale[:, None, None] + squared.origin[:, None, :]
+
+
+def _first_pass(squared: Squared, pick: Pick) -> tuple[Array, Array, Array]:
+    """Return the points (N, q, d) of the first weighting, and distances (N, s) and points (N, d) for the second one."""
+    first = _pick(squared, np.ones(squared.ranged_right.shape), None, pick)
+    point = np.where(np.isfinite(first[:, 0]), first[:, 0], 0.0)
+    distance = np.maximum(np.sqrt(((point[:, None, :] - squared.place) ** 2).sum(-1)), _NEAR)
+    return first, distance, point
+
+
+def last_weighting(problem: Problem, found: Ranges | None, pick: Pick) -> tuple[Squared, Array, Array]:
+    """Return the squared-range problem whose solutions `candidates` returns.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    found : Ranges, optional
+        Its least-squares ranges.
+    pick : callable
+        As in `candidates`.
+
+    Returns
+    -------
+    squared : Squared
+        Coordinates and quadric.
+    rows : array (N, m, n)
+        Whitened rows of the second weighting.
+    right : array (N, m)
+        Their right sides.
+    """
+    squared = squared_rows(problem, found)
+    _, distance, point = _first_pass(squared, pick)
+    return squared, *_weigh(squared, distance, point)
 
 
 def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:

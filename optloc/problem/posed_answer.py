@@ -1,0 +1,49 @@
+"""The part of a fix that comes from a posed problem: values, duals, bound, and the report of the back end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from optloc.base.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class PosedAnswer:
+    """The solution of a posed optimisation problem.
+
+    Parameters
+    ----------
+    formulation : str
+        Name of the formulation.
+    duals : mapping of str to float or array
+        Multiplier of each named constraint, in units of the objective per SI unit of the right-hand side. It is at
+        least zero for ``<=`` and for ``>=``. For ``left == right``, the gradient of the objective plus the multiplier
+        times the gradient of ``left - right`` is zero.
+    values : mapping of str to float or array
+        Left side minus right side of each named constraint in SI units; the smaller side of ``<=`` is the left one.
+    backend : formulations.solver_report.SolverReport
+        Status, residuals, relative gap, iterations and time, as the back end reports them.
+    value : float
+        Objective at the solution: chi-square, unless the objective is your own or the formulation has another one.
+    bound : float
+        Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound.
+    rank_ratio : float
+        Second over first eigenvalue of a lifted matrix, or distance from the relaxed surface; NaN if nothing is lifted.
+        A value near zero means that the relaxation is exact.
+    refined : bool
+        Whether the position of the fix was refined by least squares from this solution.
+    variables : mapping of str to array
+        Values of the variables of the posed problem, in its scaled units; a start for the next solve.
+    """
+
+    formulation: str
+    duals: Mapping[str, float | Array]
+    values: Mapping[str, float | Array]
+    backend: Any
+    value: float
+    bound: float
+    rank_ratio: float
+    refined: bool
+    variables: Mapping[str, Array]

@@ -1,0 +1,325 @@
+"""A posed problem: what convex and nonlinear formulations have in common, from named parts to the judged fix."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.problem.constraint_checks import check_constraints
+from optloc.problem.fix import Fix
+from optloc.problem.posed_answer import PosedAnswer
+from optloc.problem.problem import Problem
+from optloc.solvers.methods import Method
+from optloc.solvers.pool import begin, in_parts, noting_place, pack
+from optloc.solvers.posing.statement import Relation
+from optloc.solvers.solution import with_sources
+from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
+
+_REFINEMENT = Method(("lsr", "certify"))
+
+
+class Posed(ABC):
+    """An optimisation problem that a formulation poses, to read, to change and to solve.
+
+    Parameters
+    ----------
+    stated : Problem
+        Flat batch of one problem.
+    formulation : str
+        Name of the formulation.
+
+    Attributes
+    ----------
+    problem
+        The optimisation problem: a ``cvxpy.Problem`` whose parameters have values, or for a nonlinear program a
+        dictionary of ``casadi.SX`` with the keys x, f, g and p.
+    origin, unit
+        Scaled coordinates are ``(x - origin) / unit``, metres.
+    """
+
+    problem: Any
+    origin: Array
+    unit: float
+
+    def __init__(self, stated: Problem, formulation: str) -> None:
+        self.stated, self.formulation = stated, formulation
+        self.relations: dict[str, Relation] = {}
+        self.own_objective = False
+
+    # Parts in SI units.
+
+    @abstractmethod
+    def of(self, name: str) -> Any:
+        """Return the expression of a named part, such as "position" or "clock", in SI units.
+
+        Raises
+        ------
+        InvalidProblem
+            If the formulation has no such unknown.
+        """
+
+    @property
+    def position(self) -> Any:
+        """Return the position (d,) of the first unknown target as an expression, metres."""
+        return self.of("position")
+
+    @property
+    def velocity(self) -> Any:
+        """Return the velocity (d,) of the first unknown target as an expression, metres per second."""
+        return self.of("velocity")
+
+    @property
+    def clock(self) -> Any:
+        """Return the clock offsets as an expression, SI units."""
+        return self.of("clock")
+
+    @property
+    def range(self) -> Any:
+        """Return the range to the reference station as an expression, metres."""
+        return self.of("range")
+
+    @property
+    @abstractmethod
+    def bias(self) -> Mapping[str, Any]:
+        """Return the expressions of all unknowns except the states of targets by name, SI units."""
+
+    @property
+    @abstractmethod
+    def residual(self) -> Any:
+        """Return the residuals (m,) of the rows of the formulation as an expression, standard deviations."""
+
+    def scaled(self, value: Any) -> Any:
+        """Return a position (..., d) in scaled units, or a length as a multiple of the unit.
+
+        Parameters
+        ----------
+        value : array, float or expression
+            Metres. A value whose last axis has d entries is a position; every other value is a length.
+        """
+        return (value - self.origin) / self.unit if self._is_position(value) else value / self.unit
+
+    def si(self, value: Any) -> Any:
+        """Return a scaled position (..., d) or a scaled length in metres: the inverse of `scaled`."""
+        return self.origin + self.unit * value if self._is_position(value) else self.unit * value
+
+    def _is_position(self, value: Any) -> bool:
+        """Return whether a value has the shape of a position: d entries in its last axis, or in a column of CasADi."""
+        shape = tuple(getattr(value, "shape", np.shape(value)))
+        shape = shape[:1] if len(shape) == 2 and shape[1] == 1 else shape
+        return bool(shape) and shape[-1] == len(self.origin)
+
+    # Changes.
+
+    def add(self, constraint: Any, *, name: str | None = None) -> None:
+        """Add a constraint in SI units, divided by its own unit.
+
+        Parameters
+        ----------
+        constraint : relation, or constraint of `optloc.constraints`
+            A relation of cvxpy or CasADi between expressions of this object, such as ``posed.position[0] <= 100``. A
+            constraint of the table, and a linear relation of the position alone, hold for the fix too. Any other
+            relation holds in the posed problem only.
+        name : str, optional
+            Name for `duals` and messages; for the table the names of its constraints by default.
+
+        Raises
+        ------
+        InvalidProblem
+            If it is no relation, has no unknown of this problem, is not convex, or has a name in use.
+        """
+        members = _table_members(constraint)
+        if members is not None:
+            self._add_table(members, name)
+            return
+        if isinstance(constraint, bool | np.bool_):
+            raise InvalidProblem(
+                "the relation has no unknown of this problem", "constraint", "use posed.position or posed.of(name)"
+            )
+        free = self._new_name(name)
+        planes = self._as_planes(constraint, free)
+        if planes:
+            self._add_table(planes, free)
+        else:
+            self._put(self._relation(constraint, free))
+
+    def _add_table(self, members: Sequence[Any], name: str | None) -> None:
+        """Add constraints of the table to the `Problem` and to the posed problem; all get `name` if it is given."""
+        named = [(one.name if name is None else name, one) for one in members]
+        for label in dict.fromkeys(label for label, _ in named):
+            self._new_name(label)
+        kept = tuple(one if one.name == label else replace(one, name=label) for label, one in named)
+        stated = replace(self.stated, constraints=(*self.stated.constraints, *kept))
+        check_constraints(stated)
+        found: dict[str, list[Relation]] = {}
+        for label, one in named:
+            found.setdefault(label, []).append(self._table_relation(one, label))
+        self.stated = stated
+        for label, several in found.items():
+            parts = tuple(part for one in several for part in one.parts)
+            self._put(Relation(label, parts, tuple(d for one in several for d in one.divisor), free=False))
+
+    def _new_name(self, name: str | None) -> str:
+        """Return a name for a constraint; raise InvalidProblem if it is in use."""
+        if name is None:
+            name = next(
+                text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
+            )
+        if name in self.relations:
+            raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
+        return name
+
+    def _put(self, relation: Relation) -> None:
+        """Store a relation and state the problem with it."""
+        self.relations[relation.name] = relation
+        self._restate()
+
+    @abstractmethod
+    def minimise(self, expression: Any) -> None:
+        """Replace the objective by an expression of your own, in your unit.
+
+        Raises
+        ------
+        InvalidProblem
+            If it is not a scalar, has no unknown of this problem, or is not convex in a convex formulation.
+        """
+
+    @abstractmethod
+    def solve(
+        self,
+        solver: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        start: Any = None,
+        duals: Mapping[str, float | Array] | None = None,
+        warm_start: bool | None = None,
+        refine: bool | None = None,
+    ) -> Fix:
+        """Return the judged fix of the posed problem; ``fix.posed`` has duals, values, bound and report.
+
+        Parameters
+        ----------
+        solver : str, optional
+            Name of the back end: by default "CLARABEL", or "ipopt" for a nonlinear program.
+        settings : mapping, optional
+            Settings of the back end by its names.
+        start : Fix, array (size,) or (d,), optional
+            First iterate: an earlier fix, a vector in the order of ``problem.layout``, or a position. Interior-point
+            solvers of convex problems ignore it, and the message of the report says so.
+        duals : mapping, optional
+            Multipliers of an earlier answer, ``fix.posed.duals``.
+        warm_start : bool, optional
+            Whether the solver starts from `start` and `duals`; by default if one of them is given.
+        refine : bool, optional
+            Whether least squares refines and judges the solution. By default it does unless a constraint holds in the
+            posed problem only, or the objective is your own.
+
+        Returns
+        -------
+        Fix
+            A solution that is not refined has the status `unrefined` and no covariance. A failed solve is a status.
+        """
+
+    @abstractmethod
+    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
+        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+
+    @abstractmethod
+    def _relation(self, constraint: Any, name: str) -> Relation:
+        """Return a relation of the back end's language, divided by its own unit."""
+
+    @abstractmethod
+    def _table_relation(self, constraint: Any, name: str) -> Relation:
+        """Return a constraint of the table in the back end's language."""
+
+    @abstractmethod
+    def _restate(self) -> None:
+        """Write `problem` anew after a change."""
+
+    # The fix.
+
+    @property
+    def free(self) -> list[str]:
+        """Return the names of the constraints that hold in the posed problem only."""
+        return [one.name for one in self.relations.values() if one.free]
+
+    def _conclude(self, starts: Array, answer: PosedAnswer, refine: bool | None) -> Fix:
+        """Return the fix from solutions `starts` (q, size), the best first."""
+        wanted = not (self.free or self.own_objective) if refine is None else refine
+        if not np.isfinite(starts[0]).all() and not (wanted and np.isfinite(starts).all(1).any()):
+            return self._failed(Status.NUMERICAL, "the solution of the posed problem gives no position", answer)
+        if not wanted:
+            fix = _of_pool(self.stated, starts[:1], None)
+            reason = f"the optimum of the posed problem{self._changes()}, not refined"
+            return _marked(fix, Status.UNREFINED, reason, replace(answer, refined=False))
+        fix = _of_pool(self.stated, pack(starts[None])[0], _REFINEMENT)
+        answer = replace(answer, refined=True)
+        if not (self.free or self.own_objective):
+            return replace(fix, posed=answer)
+        without = [f"the constraint{'s' if len(self.free) > 1 else ''} {_quoted(self.free)}"] if self.free else []
+        without += ["your objective"] if self.own_objective else []
+        reason = f"refined without {' and '.join(without)}"
+        if not bool(fix.answered):
+            return replace(fix, reason=_joined(fix.reason, reason), posed=answer)
+        first = Status.UNPROVEN if int(fix.code) in (Status.OK, Status.CURVED) else Status(int(fix.code))
+        return _marked(fix, first, f"{reason}; {fix.reason[()]}".rstrip("; "), answer)
+
+    def _changes(self) -> str:
+        """Return the changes of the posed problem as the end of a sentence."""
+        what = (
+            [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
+        )
+        what += ["your objective"] if self.own_objective else []
+        return f" with {' and '.join(what)}" if what else ""
+
+    def _failed(self, code: Status, reason: str, answer: PosedAnswer) -> Fix:
+        """Return a fix without an answer."""
+        fix = replace(with_sources(self.stated, failed_fixes(self.stated, reason)).reshape(()), marks=None)
+        return _marked(fix, code, reason, replace(answer, refined=False))
+
+
+def _table_members(constraint: Any) -> list[Constraint] | None:
+    """Return constraints of the table as a list; None for anything else."""
+    kinds = Band | Polygon | AnyOf
+    if isinstance(constraint, kinds):
+        return [constraint]
+    if isinstance(constraint, tuple | list) and constraint and all(isinstance(one, kinds) for one in constraint):
+        return list(constraint)
+    return None
+
+
+def _quoted(names: Iterable[str]) -> str:
+    """Return names in quotation marks, joined by "and"."""
+    return " and ".join(f'"{name}"' for name in names)
+
+
+def _joined(reason: Any, more: str) -> Array:
+    """Return the reason of a fix, extended by a sentence, as an array without axes."""
+    out = np.empty((), dtype=object)
+    out[()] = f"{reason[()]}; {more}" if reason[()] else more
+    return out
+
+
+def _marked(fix: Fix, code: Status, reason: str, answer: PosedAnswer) -> Fix:
+    """Return a single fix with another status, reason and posed answer; only an answer with a covariance keeps it."""
+    text = np.empty((), dtype=object)
+    text[()] = reason
+    marks = np.asarray((0 if fix.marks is None else int(fix.marks)) | code.mark)
+    return replace(fix, code=np.asarray(int(code), dtype=np.int8), marks=marks, reason=text, posed=answer)
+
+
+def _of_pool(problem: Problem, starts: Array, method: Method | None) -> Fix:
+    """Return the fix that a method reaches from starts (q, size) of a flat batch of one problem; None: the starts."""
+
+    def work(some: Problem, part: slice) -> Fix:
+        pool = begin(some, starts[None])
+        with noting_place("the verdict"):
+            return hide_open_epochs(verdict(some, pool if method is None else method(some, pool)))
+
+    with np.errstate(all="ignore"):  # an overflow gets a status, so a warning would repeat it
+        return with_sources(problem, in_parts(problem, work, 1, failed_fixes)).reshape(())

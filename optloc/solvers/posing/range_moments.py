@@ -1,0 +1,173 @@
+"""Ranges as posed problems: order-2 moments in a box, order-1 lift, and the lift on an ellipsoid of known height."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.linear.mirror import one_position
+from optloc.linear.vectors import problem_at_rest, vectors
+from optloc.models import MODELS
+from optloc.models.primitives import WGS84_A
+from optloc.problem.noise import whiten
+from optloc.problem.problem import Problem
+from optloc.solvers.certificates.relaxations import enclosed_ranges
+from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.starts.position import height_sights, spread_of
+
+# Chi-square above that of the fix up to which positions are in the box of moments: a constraint may move the optimum
+# by four standard deviations. A larger box is less tight.
+_MARGIN = 16.0
+
+
+def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
+    """Return the moment relaxation of a flat batch of one problem, in the box of costs as low as that of its fix.
+
+    `locate` maps the problem to its fix.
+    """
+    from formulations.conic import rank_ratio
+    from formulations.moment_sdp import moment_problem, moment_program, moments, settings_of
+
+    about = enclosed_ranges(problem, locate(problem), _MARGIN)
+    if isinstance(about, str) or about.box is None:
+        why = about if isinstance(about, str) else "the rows do not bound the positions with a cost this low"
+        raise InvalidProblem(why, "formulation", 'use "nls"')
+    count, d = about.scaled.station.shape
+    own, data = moments(count, d), moment_program(about.scaled, about.box, about.cost)
+    program, box = moment_problem(count, d), about.box
+    set_parameters(program, data.values)
+    y = variable(program, "y")
+    place, error = own.table[:, :, 0, 0], own.table[0, 0, 0]
+    # (1, t, omega): the constant, the reference range, and the errors of the other ranges
+    first = y[np.concatenate([[0, place[0, -1]], error[1:]])]
+
+    def read() -> Array:
+        x = box.centre + box.axes @ y.value[place[0, 1:-1]]
+        return np.asarray(vectors(problem, (about.centre + about.size * x)[None, None])[0])
+
+    centre = about.centre + about.size * box.centre
+    half, middle = 0.5 * (box.high - box.low), 0.5 * (box.high + box.low)
+    return ConicStatement(
+        program=program,
+        size=data.size,
+        constant=about.loops,
+        origin=about.centre,
+        unit=about.size,
+        parts={
+            "position": centre + (about.size * box.axes) @ y[place[0, 1:-1]],
+            "range": about.size * (middle + half * y[place[0, -1]]),
+        },
+        residual=data.white @ first,
+        within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above that of the fix",
+        read=read,
+        rank_ratio=lambda: rank_ratio(y.value[place]),
+        settings=settings_of(),
+    )
+
+
+def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
+    """Return the lift on the ellipsoid for the widest three stations of a flat batch of one problem.
+
+    The objective is a squared distance, m^2: the rows fit exactly, and it selects one of the points. `locate` is not
+    used.
+    """
+    from formulations.conic import rank_ratio
+    from formulations.range_height_conic import height_program, lifted_problem, settings_of
+
+    given = height_sights(problem_at_rest(problem.straightened())) if one_position(problem) else None
+    data = None if given is None else height_program(**given)
+    if data is None:
+        raise InvalidProblem(
+            "this formulation needs three ranges with a common unknown, and a known height", "formulation", 'use "nls"'
+        )
+    program = lifted_problem()
+    set_parameters(program, data.values)
+    lift, frame = variable(program, "lift"), problem.frame
+    turn = frame.rotation_to_ecef()
+    # the position in the frame of the problem is linear in the first column of the lift
+    places = turn.T @ (WGS84_A * data.places)
+    shift = -turn.T @ frame.origin_ecef()
+
+    def read() -> Array:
+        x = frame.from_ecef(WGS84_A * (data.places @ lift.value[:, 0]))
+        return np.asarray(vectors(problem, x[None, None])[0])
+
+    return ConicStatement(
+        program=program,
+        size=data.size * WGS84_A**2,
+        origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])) if given else np.zeros(3),
+        unit=WGS84_A,
+        parts={"position": shift + places @ lift[:, 0]},
+        read=read,
+        rank_ratio=lambda: rank_ratio(lift.value),
+        settings=settings_of(),
+    )
+
+
+def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
+    """Return the order-1 lift of a flat batch of one problem whose rows are sums of ranges; `locate` is not used."""
+    from formulations.conic import rank_ratio
+    from formulations.lifted import lifted_data, lifted_problem, settings_of
+    from formulations.squared_range_conic import in_deviations
+
+    models = [MODELS[rows.kind] for rows in problem.rows]
+    if not one_position(problem) or any(model.ranges is None or model.emission for model in models):
+        raise InvalidProblem(
+            "this formulation needs ranges or their differences of one position", "formulation", 'use "nls"'
+        )
+    centre, spread = spread_of(problem)
+    origin, unit = centre[0], float(spread[0])
+    alone = problem_at_rest(problem)
+    rows, right = range_rows(alone, unit)
+    place = np.broadcast_to(alone.stations.position, (1, *alone.stations.position.shape[-3:]))[0, 0]
+    station = (place - origin) / unit
+    values, _, _ = lifted_data(rows, right, station)
+    count, d = station.shape
+    # ranges in standard deviations: a cost of a few of them is else rounding beside the squares of the ranges
+    change, inner = np.eye(1 + d + count), in_deviations(rows, right)
+    change[1 + d :, 1 + d :], change[1 + d :, 0] = inner[:, :-1], inner[:, -1]
+    table = np.concatenate([(rows @ inner[:, -1] - right)[:, None], rows @ inner[:, :-1]], axis=1)
+    size = float(np.abs(table).max()) or 1.0
+    program = lifted_problem(count, d, change)
+    set_parameters(program, {**values, "gram": table.T @ table / size**2})
+    lift = change @ variable(program, "lift") @ change.T
+
+    def read() -> Array:
+        return np.asarray(vectors(problem, (origin + unit * lift.value[0, 1 : 1 + d])[None, None])[0])
+
+    return ConicStatement(
+        program=program,
+        size=size**2,
+        origin=origin,
+        unit=unit,
+        parts={"position": origin + unit * lift[0, 1 : 1 + d], "range": unit * lift[0, 1 + d :]},
+        residual=rows @ lift[0, 1 + d :] - right,
+        read=read,
+        rank_ratio=lambda: rank_ratio(lift.value),
+        settings=settings_of(),
+    )
+
+
+def range_rows(one: Problem, scale: float) -> tuple[Array, Array]:
+    """Return whitened rows K (m, s) and values z (m,) of one problem whose rows are sums of ranges.
+
+    Parameters
+    ----------
+    one : Problem
+        Flat batch of one problem.
+    scale : float
+        Unit of length, metres: K r = z for ranges r (s,) from the stations in this unit.
+    """
+    K, start = np.zeros((one.count, one.stations.count)), 0
+    for rows in one.rows:
+        ends = MODELS[rows.kind].ranges
+        assert ends is not None
+        for index, sign in zip((rows.a, rows.b), ends, strict=True):
+            if sign:
+                K[start + np.arange(rows.count), index] += sign
+        start += rows.count
+    # Values are in units of the scale, like the stations: whitening gives numbers of order one.
+    stacked = np.concatenate([K, one.observed[0][:, None] / scale], axis=1)
+    white = np.concatenate([w.apply(stacked[None])[0] for w in whiten(one.noise, one.weight)])
+    return white[:, :-1] * scale, white[:, -1] * scale

@@ -1,0 +1,209 @@
+"""One problem as a nonlinear program whose numbers are of order one, with the compiled program of its structure.
+
+Lengths are relative to the centre of the stations and in units of their spread; y is the scaled vector, p the data of
+the program, z the measurements.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from formulations.backend import Choice, choice_for
+from formulations.nls import Program
+from optloc.base.cache import Cache
+from optloc.base.types import Array
+from optloc.linear.constraints import conjunction
+from optloc.linear.fences import fence_numbers, symbolic_cost
+from optloc.linear.normal import prior_parts
+from optloc.linear.symbolic import bounds, constrained, parameters, residual
+from optloc.linear.walks import chain_at, state_columns, walks
+from optloc.problem.noise import whiten
+from optloc.problem.problem import Problem
+from optloc.solvers.starts.position import spread_of
+
+# "1": the C compiler of the system compiles programs; this takes seconds, for many fixes of one large structure
+_COMPILE = "OPTLOC_COMPILE_NLP"
+
+
+class ScaledProblem:
+    """One problem, scaled to order one, with the compiled program of its structure.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem; station errors that no epoch shares are noise.
+    shared : bool
+        Whether the program comes from a cache; False: a new program, whose symbols belong to this problem.
+
+    Attributes
+    ----------
+    unit, centre : array (size,)
+        Unknowns in SI units are ``centre + unit * y``.
+    shift : array (d,)
+        Centre of the stations, metres.
+    length : float
+        Spread of the stations, metres.
+    data, z, weight, prior
+        Numbers of the program, as `formulations.nls.Program.solve` takes them.
+    """
+
+    def __init__(self, problem: Problem, *, shared: bool = True) -> None:
+        self.problem = problem
+        shift, size = (value[0] for value in spread_of(problem))
+        self.shift, self.length = shift, float(size)
+        layout = problem.layout
+        unit = np.concatenate(
+            [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]
+        )
+        # Positions are relative to the centre of the stations, and lengths and speeds are in spreads of the stations.
+        centre = np.zeros(layout.size)
+        for found in (layout.shared, layout.local):
+            for place in found:
+                if place.name.partition("[")[0] == "position":
+                    base = place.start + (0 if found is layout.shared else layout.n_shared)
+                    step = layout.n_local or 1
+                    for k in range(1 if found is layout.shared else layout.epochs):
+                        centre[base + k * step : base + k * step + place.size] = shift
+        self.unit, self.centre = unit, centre
+        rows = parameters(problem)
+        self.data = np.concatenate([unit, centre, rows, [size], bounds(problem), fence_numbers(problem)])
+        find = _program if shared else _new_program
+        self.program = find(problem, len(self.data), len(rows))
+        self.weight = _whitening(problem)
+        # absent rows have weight zero, but zero times NaN is NaN
+        self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
+        self.prior = _prior(problem, unit, centre)
+
+
+# Programs take up to a second to build, and some megabytes each: the cache limits the memory of studies of many
+# layouts.
+_PROGRAMS = Cache[Program](64)
+# Most iterations of IPOPT: far more than a start near a minimum takes; a start that runs to infinity never ends.
+_ITERATIONS = 200
+
+
+def _program(problem: Problem, data: int, rows: int) -> Program:
+    """Return the program of the structure of a problem, from a cache.
+
+    `data` is the number of parameters of the program, of which `rows` belong to the measurements.
+    """
+    choice, compiled = choice_for("nonlinear"), os.environ.get(_COMPILE, "") == "1"
+    s = problem.stations
+    shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
+    limits = tuple(
+        (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
+        for b in conjunction(problem)
+    )
+    # everything that shapes the program, but none of its input numbers
+    key = (problem.structure, data, shapes, limits, None if choice is None else choice.key, compiled)
+    return _PROGRAMS.find(key, lambda: _build(problem, data, rows, choice, compiled))
+
+
+def _new_program(problem: Problem, data: int, rows: int) -> Program:
+    """Return a program of the structure of a problem with its own symbols; arguments as in `_program`."""
+    return _build(problem, data, rows, None, compiled=False)
+
+
+def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
+    """Return a new program for a structure: `choice` is the solver, and `compiled` requests a C compiler.
+
+    `data` and `rows` are as in `_program`.
+    """
+    n = problem.layout.size
+    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, the bounds
+    # of the constraints, and the numbers of the fences.
+
+    def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
+        return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
+
+    def limits_at(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
+        last = 2 * n + rows
+        return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
+
+    def fence_cost(y: Any, p: Any) -> Any:
+        return symbolic_cost(problem, y * p[:n] + p[n : 2 * n], p[data - len(fence_numbers(problem)) :])
+
+    equal, more = ((lambda y, p, i=i: limits_at(y, p)[i]) if problem.constraints else None for i in (0, 1))
+    return Program(
+        n,
+        problem.count,
+        data,
+        residual=scaled_residual,
+        penalty=fence_cost if problem.fences else None,
+        equalities=equal,
+        inequalities=more,
+        diagonal=_independent(problem),
+        settings={"bound_relax_factor": 0.0, "max_iter": _ITERATIONS},  # by default IPOPT relaxes constraints by 1e-8
+        choice=choice,
+        compiled=compiled,
+    )
+
+
+def _slot_units(slots: Any, size: float) -> Array:
+    """Return the units of all entries of slots, one array: `size` for lengths and their rates, else 1.
+
+    `size` is the spread of the stations, metres.
+    """
+    # a unit that begins with m is metres, or metres per something
+    units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
+    return np.concatenate([*units, np.zeros(0)])
+
+
+def _independent(problem: Problem) -> bool:
+    """Return whether all rows have independent errors, so that a diagonal of weights replaces the whitening matrix."""
+    return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
+
+
+def _whitening(problem: Problem) -> Array:
+    """Return the whitening matrix (m, m) of m rows, or the weights (m,) alone if errors are independent."""
+    rows = problem.count
+    matrix = np.zeros(rows if _independent(problem) else (rows, rows))
+    for whitener in whiten(problem.noise, problem.weight):
+        full = np.broadcast_to(whitener.matrix, (1, *whitener.row.shape, whitener.row.shape[1]))[0]
+        if matrix.ndim == 1:
+            matrix[whitener.row[:, 0]] = full[:, 0, 0]
+            continue
+        for members, block in zip(whitener.row, full, strict=True):
+            matrix[np.ix_(members, members)] = block
+    return matrix
+
+
+def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
+    """Add the walks of biases to prior means (size,) and information (size, size): steps of a walk are zero on average.
+
+    Both arrays are written.
+    """
+    layout = problem.layout
+    chain = chain_at(problem, np.zeros((1, layout.size)))
+    starts = layout.n_shared + layout.n_local * np.arange(layout.epochs)
+    columns_of_epoch = starts[:, None] + np.arange(layout.n_local)
+    information[columns_of_epoch[:, :, None], columns_of_epoch[:, None, :]] += chain.block
+    information[columns_of_epoch[:-1, :, None], columns_of_epoch[1:, None, :]] += chain.link
+    information[columns_of_epoch[1:, :, None], columns_of_epoch[:-1, None, :]] += chain.link.mT
+    for bias in walks(problem):
+        # a walk that stays at its prior mean costs nothing
+        if bias.sigma is not None:
+            place = starts[:, None] + state_columns(layout, bias)[:, 0]
+            mean[place] = np.ravel(bias.mean)
+
+
+def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
+    """Return the prior mean (size,) and the prior information (size, size) in scaled units.
+
+    `unit` and `centre` (size,) are the unit and the origin of each scaled unknown.
+    """
+    layout = problem.layout
+    mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
+    for name, value, precision in prior_parts(problem):
+        slot, shared = layout.find(name)
+        for k in range(1 if shared else layout.epochs):
+            start = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
+            part = slice(start, start + slot.size)
+            mean[part] = value.reshape(-1, value.shape[-1])[0]
+            information[part, part] = precision.reshape(-1, slot.size, slot.size)[0]
+    if walks(problem):
+        _add_walks(problem, mean, information)
+    return (mean - centre) / unit, information * unit[:, None] * unit[None, :]
