@@ -195,11 +195,11 @@ def test_file_and_python_give_the_same_fix(kind, tmp_path):
     keys, _, wanted, settings = CASES[kind]
     from_file = load(written(tmp_path, document(f'kind = "{kind}"\n{keys}', **settings)))
     found = solve(from_file, "gtrs+lsr")
-    assert np.isfinite(found.position).all()
+    assert np.isfinite(found.x).all()
     assert float(violation(from_file, found.x[None])[0]) < 1e-6
     if wanted is not None:
         other = solve(dataclasses.replace(from_file, constraints=tuple(wanted), fences=()), "gtrs+lsr")
-        np.testing.assert_allclose(found.position, other.position, atol=1e-6)
+        np.testing.assert_allclose(found.x, other.x, atol=1e-6)
         assert found.status == other.status
 
 
