@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         write_text as write_text,
         written as written,
     )
+    from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (
         Context as Context,
         ends_of as ends_of,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
         Loaded as Loaded,
         assemble as assemble,
         draft as draft,
-        from_table as from_table,
         load as load,
         read as read,
     )
