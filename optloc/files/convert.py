@@ -31,7 +31,7 @@ from optloc.files.pseudoranges import is_gnss
 from optloc.files.reading_report import check_receivers, reading_lines, unused_columns, uses_of
 from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
 from optloc.files.table_import import (
     CONVENTIONS,

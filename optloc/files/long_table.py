@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
 from optloc.base.moved import renamed
 from optloc.base.types import Stations
+from optloc.files.constraint_reader import StatedConstraints, stated_arguments
 from optloc.files.reader import assemble
 from optloc.files.schema import validate
 from optloc.files.stations import station_table
@@ -33,7 +34,7 @@ def from_table(
     window: str | None = None,
     wave_speed: float | str | None = None,
     station_options: Mapping[str, object] | None = None,
-    constraints: Sequence[Mapping[str, object]] = (),
+    constraints: StatedConstraints = (),
     values: bool = True,
     propagation_speed: float | str | None = None,
     **options: object,
@@ -65,8 +66,9 @@ def from_table(
         Metres per second, or text such as ``"air:20C"`` (as in `optloc.locate`); by default light in vacuum.
     station_options : mapping, optional
         Further keys of the table ``[stations]`` of a problem file, for instance ``{"unit": "km"}``.
-    constraints : sequence of mapping
-        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``.
+    constraints : sequence of mapping or of constraints
+        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``; or
+        constraints of `optloc.constraints`.
     values : bool
         Whether measured values are required; False to simulate them.
     propagation_speed : float or str, optional
@@ -98,7 +100,7 @@ def from_table(
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},
-        "constraints": [dict(constraint) for constraint in constraints],
     }
-    file = with_profile(validate(settings, "arguments"), None, "arguments")
-    return assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
+    file, limits = with_profile(validate(settings, "arguments"), None, "arguments"), stated_arguments(constraints)
+    rows = [of_frame(table, "table", names)]
+    return assemble(file, places, rows, "arguments", values=values, limits=limits).loaded.problem

@@ -12,7 +12,8 @@ from optloc.base.sound import sound_in_air, sound_in_water
 from optloc.base.types import Array, Bias, Stations
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.measurements import RowChunk
-from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable, Units, join
+from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable
+from optloc.files.settings import Units, join
 from optloc.files.wave_speed import StatedSpeed, stated_speed, wind_of
 from optloc.models.medium import Atmosphere, Layers, Medium, Wind
 from optloc.problem.bias import SPEED, scale_of

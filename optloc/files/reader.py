@@ -19,6 +19,13 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, check_budget
 from optloc.base.types import Array, Bias, Rows, Stations
+from optloc.files.constraint_reader import (
+    Demand,
+    constraints_of,
+    demands_of,
+    limits_of,
+)
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.measurements import (
     ESTIMATE,
     RowChunk,
@@ -31,20 +38,13 @@ from optloc.files.measurements import (
 )
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
-from optloc.files.schema import (
-    ConstraintTable,
-    ProblemFile,
-    Units,
-    join,
-    name_of,
-    read_document,
-)
+from optloc.files.schema import ProblemFile, name_of, read_document
+from optloc.files.settings import Units, join
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
 from optloc.files.unknowns import (
     FREE,
     bias_of,
-    constraints_of,
     known_of,
     motions_of,
     needs_clock,
@@ -205,11 +205,11 @@ def draft(
     file, source = with_options(read_document(path), wave), name_of(path)
     file = with_profile(file, path.parent, source)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
-    known = places_of(file, path.parent, source)
+    known, limits = places_of(file, path.parent, source), limits_of(file, path.parent, source)
     stations = table_of(file.stations, path.parent, join(source, "[stations]"))
     places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
     tables = [table_of(m, path.parent, place) for m, place in zip(file.measurements, places, strict=True)]
-    return assemble(file, stations, tables, source, values=values, known=known, more=more)
+    return assemble(file, stations, tables, source, values=values, known=known, limits=limits, more=more)
 
 
 def assemble(
@@ -220,6 +220,7 @@ def assemble(
     *,
     values: bool,
     known: Mapping[str | None, Table] | None = None,
+    limits: Mapping[str, Demand] | None = None,
     more: Mapping[str, ConstraintTable] | None = None,
 ) -> Draft:
     """Return the problem of settings and tables.
@@ -238,6 +239,8 @@ def assemble(
         Whether measured values are required.
     known : mapping of str to Table, optional
         Positions of known targets by name; None is the key of the single target.
+    limits : mapping of str to constraints, optional
+        The constraints by their place for messages, see `limits_of`; by default those of `file`.
     more : mapping of str to ConstraintTable, optional
         As in `read`.
     """
@@ -275,16 +278,15 @@ def assemble(
     units = {bias.name: unit for bias, unit in biases if unit[0]}  # no entry for rows in several units
     all_biases = tuple(bias for bias, _ in biases)
     all_biases += speed_bias(file, written, all_biases, source)
-    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, more or {})
-    # The estimation of noise needs fixes, and so the whole problem: do it last.
+    demands = {**(limits_of(file, None, source) if limits is None else limits), **demands_of(more or {})}
+    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, demands)
+    # The estimation of noise needs fixes, so do it last.
     problem, levels = with_noise(file, problem, source)
-    title = file.title or source
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
-    loaded = Loaded(problem, source, title, *named, levels, units, azimuths, speed=words)
-    return Draft(
-        loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _has_moving_target(problem)
-    )
+    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words)
+    moving = found.moving or _has_moving_target(problem)
+    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 
 
 def _problem(
@@ -297,11 +299,11 @@ def _problem(
     frame: Frame,
     source: str,
     known: Mapping[str | None, Table],
-    more: Mapping[str, ConstraintTable],
+    demands: Mapping[str, Demand],
 ) -> Problem:
     """Return the checked problem with the motions, priors, constraints and medium of the file.
 
-    `known` has the positions of known targets by name. `more` has further constraints, by their place for messages.
+    `known` has the positions of known targets by name, and `demands` the constraints by their place for messages.
     """
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
@@ -309,8 +311,6 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
-    demands |= more
     constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     check_budget("unknowns", made.layout.n_shared, source)

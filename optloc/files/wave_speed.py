@@ -20,7 +20,8 @@ from optloc.base.types import Array
 from optloc.base.units import LARGEST, SPEED_OF_LIGHT, UNITS, Quantity
 from optloc.files.columns import stem, unit_of
 from optloc.files.csv_formats import read_table
-from optloc.files.schema import DataTable, MediumTable, ProblemFile, Units, join
+from optloc.files.schema import DataTable, MediumTable, ProblemFile
+from optloc.files.settings import Units, join
 from optloc.files.table import Table, table_of
 
 FORMS = '"343 m/s", "343+-5 m/s", "air:20C", "air:20C,50%", "water:8C,35,50m", "profile.csv" or "light"'
