@@ -94,8 +94,8 @@ def run_fix(
     `more` has the constraints by the name of their option. `as_json` prints JSON, and `quiet` prints nothing. `out`,
     `geojson_path`, `plot` and `html` are the files to write: results, GeoJSON, picture and page; None for no file.
     `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table, or the
-    options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the grouping of
-    `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to the stated noise.
+    options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the
+    grouping of `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to it.
     `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
     """
     on_output = geojson_path is not None and str(geojson_path) == "-"
