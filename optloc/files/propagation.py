@@ -222,7 +222,8 @@ def fits_sound(longest: float, noise: float, extent: float) -> bool:
     """
     if not extent > 0.0:
         return False
-    return _SLOWEST * longest < SPEED_OF_LIGHT * extent < _FASTEST * longest or noise > _USELESS * extent
+    product = SPEED_OF_LIGHT * extent
+    return _SLOWEST * longest < product and (product < _FASTEST * longest or noise > _USELESS * extent)
 
 
 def _longest(chunk: RowChunk, group: Array) -> float:
