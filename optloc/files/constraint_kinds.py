@@ -14,15 +14,15 @@ from typing import Any, cast
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest, no_station
-from optloc.base.types import Array, Constraint, Motion
-from optloc.base.units import UNITS
+from optloc.base.types import Array, Constraint, Fence, Motion
+from optloc.base.units import UNITS, Quantity
 from optloc.files.constraint_values import ConstraintValues
 from optloc.linear import constraints
 from optloc.models.surfaces import SURFACES
 from optloc.problem.constraint_checks import check_polygon
 
-Made = Sequence[Constraint] | tuple[Motion, Sequence[Constraint]]
-"""Constraints; a height along a course also determines the motion that can keep it."""
+Made = Sequence[Constraint | Fence] | tuple[Motion, Sequence[Constraint]]
+"""Constraints and fences; a height along a course also determines the motion that can keep it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +116,12 @@ def _band(v: ConstraintValues) -> Made:
     """Return the band ``min <= normal . position <= max``."""
     v.plan()
     return constraints.band(v.direction(), *v.bounds("length"), **v.naming)
+
+
+def _fence(v: ConstraintValues) -> Made:
+    """Return a half-plane with an uncertain boundary: a term of the cost."""
+    v.plan()
+    return constraints.fence(v.direction(), v.amount("offset"), v.positive("sigma"), **v.naming)
 
 
 def _disc(v: ConstraintValues) -> Made:
@@ -373,7 +379,7 @@ def _quantity(v: ConstraintValues) -> Made:
         what = f"{v.kind} has {len(given)} coefficients, not {wanted}"
         raise InvalidProblem(what, v.place("coefficients"), "give SI numbers, in the order of the quantity")
     # Bounds in units need a quantity whose SI unit optloc knows; bounds of other quantities are plain numbers.
-    quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
+    quantity: Quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
     lower, upper = v.bounds(quantity)
     return constraints.quantity(v.kind, lower, upper, np.array(given, dtype=float), **v.naming)
 
@@ -396,6 +402,13 @@ CONSTRAINT_KINDS: dict[str, ConstraintKind] = {
         "normal . position is at most the offset; in space a half-space",
         ("unit",),
         "half-plane normal=1,0 offset=2 km",
+    ),
+    "fence": ConstraintKind(
+        _fence,
+        (("normal", "offset", "sigma"),),
+        "half-plane with an uncertain boundary: beyond it, the target is improbable",
+        ("unit",),
+        "fence normal=1,0 offset=2 km sigma=50 m",
     ),
     "band": ConstraintKind(
         _band,

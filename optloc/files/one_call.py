@@ -18,10 +18,10 @@ from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.moved import renamed
-from optloc.base.types import Amount, Array, Band, Constraint, Motion, Stations
+from optloc.base.types import Amount, Array, Band, Motion, Stations
 from optloc.base.units import AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
-from optloc.files.constraint_reader import StatedConstraints, constraints_of, stated_arguments
+from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
 from optloc.files.propagation import is_time
 from optloc.files.roles import with_standard_columns
@@ -307,9 +307,9 @@ def _problem_of(
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
         made = _rows(word, found, sigma_si, step, places, wave, timed=timed[-1])
         rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
-    found, motions = _constraints(height, limits, places, given, speed)
+    stated, motions = _constraints(height, limits, places, given, speed)
     medium = wave.medium
-    problem = assemble(places.stations, *rows, frame=places.frame, constraints=found, motions=motions, medium=medium)
+    problem = assemble(places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, medium=medium)
     return with_speed(problem, wave, timed), labels
 
 
@@ -359,7 +359,7 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
 
 def _constraints(
     height: Any, limits: StatedConstraints, places: _Receivers, given: Mapping[str, Any], speed: float
-) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
     """Return the constraints of the target, and its motion.
 
     `height` and `limits` are the arguments `height` and `constraints` of `locate`. `given` has the measurements by
@@ -370,7 +370,7 @@ def _constraints(
     if not demands:
         return _heights(height, places, given), still
 
-    def found(more: dict[str, Any]) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+    def found(more: dict[str, Any]) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
         """Return the stated constraints together with `more`."""
         return constraints_of(demands | more, places.stations, places.frame, still, ("target",), np.zeros(1), speed)
 
