@@ -117,9 +117,9 @@ def run_track(
 ) -> int:
     """Track the targets of a file or a table, write the requested files, and return the exit code.
 
-    `wanted` has the options of the tracks, and `more` further constraints by the name of their option. After an error, the track so far is written first. A killed run leaves a CSV
-    file next to `out`, with ``.partial`` appended to its name. At most the rows of the last tenth of a second are
-    missing.
+    `wanted` has the options of the tracks, and `more` further constraints by the name of their option. After an error,
+    the track so far is written first. A killed run leaves a CSV file next to `out`, with ``.partial`` appended to its
+    name. At most the rows of the last tenth of a second are missing.
     """
     dynamics = dynamics_of(wanted)
     # Reject wrong names before reading the file.

@@ -287,7 +287,7 @@ def _level(v: ConstraintValues, low: float, high: float) -> Made:
 
 
 def _level_plane(v: ConstraintValues, low: float, high: float) -> Made:
-    """Return the constraint on the third coordinate of a frame that is not on Earth; raise InvalidProblem in a plane."""
+    """Return the constraint on the third coordinate in a frame that is not on Earth."""
     if v.dimension != 3:
         advice = "give x, y, z of each station, or remove the height"
         raise InvalidProblem("stations in the plane have no height", v.where, advice)
