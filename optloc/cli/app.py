@@ -217,6 +217,7 @@ def track(
         str | None,
         typer.Option(metavar="P[,V[,A]]", help="Standard deviations of --start: position, velocity, acceleration."),
     ] = None,
+    height: Height = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
@@ -232,8 +233,8 @@ def track(
 
     wanted = TrackOptions(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
     files = {"out": out, "plot": plot, "html": html}
-    hints = table_hints(file, given)
-    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=hints))
+    hints, more = table_hints(file, given), constraints(height, False, None)
+    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=hints, more=more))
 
 
 @app.command(

@@ -309,7 +309,12 @@ Geodetic = Annotated[
     bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
 ]
 Height = Annotated[
-    str | None, typer.Option("--height", metavar="H", help="Known height above the ellipsoid: 500, or '1640 ft'.")
+    str | None,
+    typer.Option(
+        "--height",
+        metavar="H",
+        help="Known height above the ellipsoid, or along z of a frame that is not on Earth: 500, or '1640 ft'.",
+    ),
 ]
 AboveGround = Annotated[bool, typer.Option("--above-ground", help="The target is above the ellipsoid.")]
 Box = Annotated[

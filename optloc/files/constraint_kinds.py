@@ -275,12 +275,25 @@ def _height(v: ConstraintValues) -> Made:
 def _level(v: ConstraintValues, low: float, high: float) -> Made:
     """Return the motion that can keep a height between two values, m, and the constraint.
 
-    A moving target with a height along its course follows the Earth.
+    On Earth, a moving target with a height along its course follows the Earth. Elsewhere the height is the third
+    coordinate.
     """
+    if not v.frame.geodetic:
+        return _level_plane(v, low, high)
     # bounds of a height that may curve hold at one time: inside them at both ends, the course may still leave them
     along = v.given["along"] if v.has("along") else v.motion.order < 2 or low == high
     over = replace(v.motion, over="ground") if along and moves(v.motion) else v.motion
     return over, constraints.height(low, high, along=along, **v.naming)
+
+
+def _level_plane(v: ConstraintValues, low: float, high: float) -> Made:
+    """Return the constraint on the third coordinate in a frame that is not on Earth."""
+    if v.dimension != 3:
+        advice = "give x, y, z of each station, or remove the height"
+        raise InvalidProblem("stations in the plane have no height", v.where, advice)
+    along = v.given["along"] if v.has("along") else v.motion.order < 2 or low == high
+    planes = constraints.box([-np.inf, -np.inf, low], [np.inf, np.inf, high], **v.naming)
+    return [replace(plane, name="height", along=along) for plane in planes[2:]]
 
 
 def moves(motion: Motion) -> bool:

@@ -47,6 +47,7 @@ from optloc.files.table_import import (
     without_ignored_columns,
 )
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.table_wave import with_wave
 from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
@@ -155,7 +156,8 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
-    return table_problem
+    stated = f"exactly = {json.dumps(hints.height)}" if hints.height is not None else table_problem.height
+    return with_wave(replace(table_problem, height=stated), hints.wave)
 
 
 def _of_table(source: Path, hints: ColumnHints) -> TableProblem:

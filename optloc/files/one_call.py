@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
+from optloc.base.moved import renamed
 from optloc.base.types import Amount, Array, Band, Motion, Stations
-from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
+from optloc.base.units import AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
@@ -28,10 +29,10 @@ from optloc.files.schema import FrameTable, StationsTable
 from optloc.files.settings import Units
 from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
+from optloc.files.wave_argument import Wave, check_times, wave_of, with_speed
 from optloc.linear import constraints
 from optloc.models import MODELS
 from optloc.models.medium import Medium
-from optloc.problem.bias import scale_of
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -49,8 +50,6 @@ Values: TypeAlias = (
 
 # Smallest distance of a point on Earth from the centre (at the poles), metres.
 _SURFACE = 6.3e6
-# Arrivals differ at most by the distance between two stations. This multiple of it means a wrong unit.
-_TOO_FAR = 100.0
 # Caches of receivers and of unit conversions with standard deviations: repeated calls reuse them.
 _PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
 # Quantities whose bounds determine the level of a target.
@@ -104,8 +103,9 @@ def locate(
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
 @overload
 def locate(
@@ -126,8 +126,9 @@ def locate(
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
 def locate(
     stations: Places | None = None,
@@ -147,8 +148,9 @@ def locate(
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix:
     """Return the fix of a target from the measurements of receivers, in one call.
 
@@ -199,12 +201,15 @@ def locate(
         Earth. It is added to compass bearings.
     frame : "cartesian" or "ecef"
         Frame of x, y, z of the stations.
-    speed : float, str, (float, float), Layers or Atmosphere
-        Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
-        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard
-        deviation: the speed is then estimated with the position, from all measurements that are times.
+    wave_speed : float, str, (float, float), Layers, Atmosphere or Wind
+        Wave speed: m/s; a text such as "1480 m/s", "343+-5 m/s", "air:20C", "air:20C,50%" (humid), "water:8C,35,50m"
+        (salinity, depth), or the file of a profile; a pair of a speed and its standard deviation; or a medium of
+        `optloc.models`, in which rays bend or the wind carries the wave. By default light. A speed with a standard
+        deviation is estimated with the position, from all measurements that are times.
     method : str
         Method as in `optloc.solve`.
+    speed : float, str, (float, float), Layers or Atmosphere
+        Old name of `wave_speed`.
 
     Returns
     -------
@@ -236,9 +241,9 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    through, speed_sigma = _speed(speed), _speed_sigma(speed)
+    wave = wave_of(renamed("speed", speed, "wave_speed", wave_speed))
     problem, labels = _problem_of(
-        stations, latlon, given, sigma, unit, reference, height, constraints, frame, through, speed_sigma, north
+        stations, latlon, given, sigma, unit, reference, height, constraints, frame, wave, north
     )
     return _labelled(solve(problem, method=method), labels)
 
@@ -267,35 +272,6 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
         raise InvalidProblem("there are no bearings", "declination", "remove this argument")
 
 
-def _speed_sigma(given: Any) -> float | None:
-    """Return the standard deviation, m/s, of a speed that is a pair; else None."""
-    return float(in_si(given[1], "speed", "speed")) if isinstance(given, tuple | list) else None
-
-
-def _speed(given: Any) -> float | Medium:
-    """Return the propagation speed, m/s, or the medium, from the argument `speed` of `locate`.
-
-    Raise InvalidProblem for a value that is not positive, or for a tuple without exactly two numbers.
-    """
-    if isinstance(given, Medium):
-        return given
-    if isinstance(given, tuple | list):
-        if len(given) != _PAIR:
-            raise InvalidProblem(
-                f"the speed has {len(given)} numbers", "speed", "give (speed, sigma), such as (343, 5)"
-            )
-        _speed(given[1])  # the standard deviation must be positive as well
-        return _speed(given[0])
-    try:
-        given = in_si(given, "speed", "speed")
-    except InvalidProblem as error:
-        raise InvalidProblem(error.what, "speed", f"{error.advice}, or give optloc.models.Layers") from None
-    if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
-        advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
-        raise InvalidProblem("the speed is not a positive number", "speed", advice)
-    return float(given)
-
-
 def _texts(unit: Any) -> list[tuple[str, Any]]:
     """Return pairs of name and value that must be text, for a unit or a mapping of units."""
     return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
@@ -311,17 +287,15 @@ def _problem_of(
     height: Any,
     limits: StatedConstraints,
     frame: str,
-    through: float | Medium,
-    speed_sigma: float | None,
+    wave: Wave,
     north: _North,
 ) -> tuple[Problem, list[Any] | None]:
     """Return the problem of the arguments of `locate`, and the labels of its rows; None without labels.
 
-    `given` has the measurements by the name of their argument. `through` is the propagation speed, m/s, or the medium.
-    `speed_sigma` is the standard deviation of the speed, m/s; None for an exact speed. `north` is the zero direction of
-    bearings. The other parameters are arguments of `locate`.
+    `given` has the measurements by the name of their argument. `wave` is the wave that converts times to lengths.
+    `north` is the zero direction of bearings. The other parameters are arguments of `locate`.
     """
-    medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
+    speed = wave.speed
     places = _PLACES.call(_receivers, stations, latlon, frame)
     rows, timed, labels = [], [], None
     for word, values in given.items():
@@ -330,23 +304,13 @@ def _problem_of(
         value_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
         step, sigma_si = _SCALES.call(_scale, word, value_unit, sigma, list(given), speed, convention)
-        made = _rows(word, found, sigma_si, step, places, speed)
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
+        made = _rows(word, found, sigma_si, step, places, wave, timed=timed[-1])
         rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
     stated, motions = _constraints(height, limits, places, given, speed)
+    medium = wave.medium
     problem = assemble(places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, medium=medium)
-    return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels
-
-
-def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
-    """Return a problem in which the propagation speed is unknown, as a scale bias of all rows that are times.
-
-    `speed` and `sigma` are the mean and the standard deviation of the speed, m/s. `timed` is whether each group of rows
-    has times.
-    """
-    ends = [(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
-    times = [np.arange(*end) for end, time in zip(ends, timed, strict=True) if time]
-    return replace(problem, biases=(*problem.biases, scale_of(speed, sigma, times, "speed")))
+    return with_speed(problem, wave, timed), labels
 
 
 def _scale(
@@ -361,9 +325,6 @@ def _scale(
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
     return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
-
-# Length of a speed with its standard deviation.
-_PAIR = 2
 
 # Receivers.
 
@@ -501,26 +462,27 @@ def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
 
 
 def _rows(
-    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, speed: float
+    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, wave: Wave, *, timed: bool
 ) -> Measured:
     """Return measurements in SI units as rows; missing values have the weight 0.
 
-    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `speed` the
-    propagation speed, m/s. Raise InvalidProblem for infinite values, or for times in a wrong unit.
+    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `wave` the wave
+    of the call. `timed` is whether the values are times. Raise InvalidProblem for infinite values, or for times in a
+    wrong unit.
     """
     kind = ARGUMENTS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T  # b is -1 except for time differences
     values = found.values
     if word == "toa":
         # Dates always become seconds, independent of the unit of sigma.
-        unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
+        unit = conversion("s", "length", propagation_speed=wave.speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
     z = np.asarray(unit.to_si(values), dtype=float)
     present = np.isfinite(z)
     if np.isinf(z).any():
         raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
-    if word in ("toa", "tdoa"):
-        _check_time_unit(word, z, sigma, places)
+    if timed or word in ("toa", "tdoa"):
+        check_times(word, z, sigma, places.extent, wave)
     columns = {"weight": present.astype(float), "a": a, "b": None if word != "tdoa" else b}
     # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
     # form loops, this is the cautious choice: a difference that follows from others adds no information.
@@ -568,15 +530,3 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
         advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times relative to a recent time"
         raise InvalidProblem(what, "toa", advice)
     return counted
-
-
-def _check_time_unit(word: str, z: Array, sigma: float, places: _Receivers) -> None:
-    """Raise InvalidProblem for times that are much longer than the paths between stations: their unit is wrong.
-
-    `z` (..., m) are the times as lengths, m, and `sigma` is their standard deviation, m. The limit is 100 times the
-    greater of the extent of the stations and `sigma`.
-    """
-    most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
-    if most > _TOO_FAR * max(places.extent, sigma):
-        what = f"the arrivals are {most / 1e3:.3g} km apart, but the stations {places.extent / 1e3:.3g} km"
-        raise InvalidProblem(what, word, "state the unit of the times, such as unit='ns', or correct them")

@@ -138,6 +138,10 @@ class MeasurementsTable(DataTable):
     """Sign of differences (and sense of ratios): a minus b, or b minus a."""
     excess: bool = False
     """Whether the distance between the two stations is subtracted from a range_sum."""
+    two_way: bool = False
+    """Whether ranges are times of the way there and back."""
+    turn_around: Amount | None = None
+    """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None
@@ -303,9 +307,11 @@ class ProblemFile(FileTable):
     title: str | None = None
     """Title of the problem."""
     propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | SpeedTable | None = None
-    """Metres per second, or text with a unit; or for sound: { medium = "air", celsius = 20.0 }. By default light.
-    A speed with a sigma is estimated with the target: { value = 343.0, sigma = 5.0 }.
+    """Metres per second; "343 m/s", "343+-5 m/s", "air:20C,50%", "water:8C,35,50m" or the file of a profile; or
+    { medium = "air", celsius = 20.0 }; or { value = 343.0, sigma = 5.0 }, estimated with the target. By default light.
     With layers: the speed that converted times to ranges in metres."""
+    wind: str | list[float] | None = None
+    """Velocity of the medium: "5 m/s from 270" (degrees from north), or components towards the axes, m/s."""
     medium: MediumTable | None = None
     """Layers or air, if the speed is not one number."""
     frame: FrameTable = FrameTable()

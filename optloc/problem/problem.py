@@ -31,7 +31,7 @@ from optloc.base.types import (
 )
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
-from optloc.models.medium import Atmosphere, Medium
+from optloc.models.medium import Atmosphere, Medium, Wind
 from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
@@ -289,6 +289,9 @@ def check_medium(problem: Problem) -> None:
     medium, frame = problem.medium, problem.frame.kind
     if medium is None:
         return
+    if isinstance(medium, Wind):
+        _check_wind(problem, medium)
+        return
     if problem.dimension != 3:
         raise InvalidProblem("a medium needs three dimensions, and the stations have two", "medium", "give z or height")
     if isinstance(medium, Atmosphere):
@@ -306,6 +309,18 @@ def check_medium(problem: Problem) -> None:
         depths = f"{medium.surface - high:g} to {medium.surface - low:g} m"
         what = f"station {name!r} is at depth {medium.surface - station_height:g} m, and the speeds are for {depths}"
         raise InvalidProblem(what, "stations", "widen the table of speeds, or check the sign of z")
+
+
+def _check_wind(problem: Problem, wind: Wind) -> None:
+    """Raise if the axes of a wind differ from the axes of the frame, or for rows in which the wave goes both ways."""
+    if len(wind.velocity) > problem.dimension:
+        raise InvalidProblem("the wind has three components, and the stations have two", "wind", "leave out the third")
+    if problem.frame.kind == "ecef" and len(wind.velocity) < problem.dimension:
+        advice = 'give three components, or use the frame "enu" with an origin'
+        raise InvalidProblem("the axes of the frame are not east and north", "wind", advice)
+    sums = next((rows.kind for rows in problem.rows if rows.kind.endswith("range_sum")), None)
+    if sums is not None:
+        raise InvalidProblem("a range sum has no single direction through the wind", "wind", "remove the wind")
 
 
 # Parts of a structure that few problems have. Problems without them keep the keys of stored simulations.
