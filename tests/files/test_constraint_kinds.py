@@ -266,8 +266,12 @@ def test_missing_and_unknown_keys():
         check_keys("disc", {"x", "y"}, "here")
     with pytest.raises(InvalidProblem, match="annulus has no key 'radius'"):
         check_keys("annulus", {"x", "y", "radius"}, "here")
-    with pytest.raises(InvalidProblem, match="disc has no values; give x, y, radius or lat_deg, lon_deg, radius"):
-        check_keys("disc", set(), "here")
+    with pytest.raises(InvalidProblem, match="disc has no centre; give x, y or lat_deg, lon_deg"):
+        check_keys("disc", {"radius"}, "here")
+    with pytest.raises(InvalidProblem, match="terrain has no bound; give exactly or min or max"):
+        check_keys("terrain", {"file"}, "here")
+    with pytest.raises(InvalidProblem, match="polyline has no shape; give points or points_deg or file"):
+        check_keys("polyline", {"tolerance"}, "here")
     check_keys("above-ground", set(), "here")
 
 
