@@ -46,8 +46,8 @@ _BENT, _ROUNDED = 0.02, 1e-3
 _EXACT = 1e-12
 # Relative difference of widths below which intervals count as equally short: the accuracy of the nodes.
 _ALIKE = 0.01
-# Points on a ray at which the admitted parts are looked for, and halvings of the interval that contains an end of a part.
-_TRIED, _HALVINGS = 64, 30
+# Points on a ray at which admitted parts are looked for, and halvings of the interval that contains an end of a part.
+_TRIED, _HALVINGS = 48, 20
 # Length of a step, in steps, up to which the first bound is looked for: the density ends before.
 _FAR = 10.0
 # Relative extension of polygon edges, so that a ray through a corner meets one of the two edges.
