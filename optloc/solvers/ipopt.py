@@ -99,10 +99,10 @@ def _on_face(problem: Problem, start: Array, item: Array, face: Face) -> tuple[A
         cost = equations_at(part, np.where(np.isfinite(x), x, start)).cost
     ends, least, code = start.copy(), np.full(len(start), np.inf), np.full(len(start), int(Status.NUMERICAL))
     for i in np.unique(item):
-        solver = _ScaledProblem(on_face(problem.take(np.array([i])), face))
+        solver = ScaledProblem(on_face(problem.take(np.array([i])), face))
         own = np.flatnonzero(item == i)
         for k in own[np.argsort(cost[own], kind="stable")][:_STARTS]:
-            ends[k], least[k], code[k] = solver.from_start(x[k] if np.isfinite(x[k]).all() else start[k])
+            ends[k], least[k], code[k] = _from_start(solver, x[k] if np.isfinite(x[k]).all() else start[k])
     number = faces(problem).index(face)
     code = _stationary(part, ends, code, np.full(len(ends), number))
     return ends, np.where(code == Status.NUMERICAL, np.inf, least), code
