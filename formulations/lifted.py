@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.nls import Local, Program
+from formulations.unit_scale import PointScale
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +118,10 @@ def lifted_ranges(
     right : array_like, shape (q,)
         Whitened z.
     station : array_like, shape (M, d)
-        Positions, numbers of order one.
+        Positions, in any unit of length.
     reach : float
-        Largest ``|x|`` allowed, ten extents of the array: range differences leave the lift unbounded without it.
+        Largest allowed distance of x from the mean of the stations, in extents of the array: range differences leave
+        the lift unbounded without it. The bound holds within this distance.
     backend : str
         Conic solver.
 
@@ -134,6 +136,8 @@ def lifted_ranges(
     """
     K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
     count, dim = S.shape
+    own = PointScale.of(S)
+    S, K = own.scaled(S), K * own.unit
     table = np.concatenate([-z[:, None], K], axis=1)
     size = float(np.abs(K).max()) or 1.0  # whitened rows are large where noise is small
     relaxation = _relaxation(count, dim, backend)
@@ -145,6 +149,7 @@ def lifted_ranges(
     lift = answer.values["lift"]
     point, ranges = lift[0, 1 : 1 + dim].copy(), lift[0, 1 + dim :].copy()
     bound = max(answer.bound, 0.0) * size**2  # a sum of squares is not negative
+    point, ranges = own.back(point), own.unit * ranges
     return Lifted(point, ranges, answer.primal * size**2, bound, rank_ratio(lift), answer)
 
 
