@@ -68,6 +68,9 @@ def is_complete(report, name):
     assert report.status
     assert 0.0 <= report.primal_residual < 1e-4
     assert 0.0 <= report.dual_residual < 1e-4
+    # the lowest supported versions of some solvers report no gap
+    if np.isnan(report.gap) and name in ("OSQP", "HIGHS"):
+        return
     assert 0.0 <= report.gap < 1e-4
     assert report.worst == max(report.primal_residual, report.dual_residual, report.gap)
     assert report.iterations > 0

@@ -143,12 +143,11 @@ def test_an_infeasible_problem_has_its_status_and_no_values():
 
 
 def test_problems_without_constraint_or_with_odd_parameters_are_refused():
-    x, p = cp.Variable(2, name="x"), cp.Parameter((2, 2), PSD=True, name="p")
-    p.value = np.eye(2)
+    x, p, q = cp.Variable(2, name="x"), cp.Parameter(2, name="p", value=[1, 1]), cp.Parameter(2, name="p", value=[1, 2])
     with pytest.raises(ValueError, match="no constraint"):
         cone_program(cp.Problem(cp.Minimize(cp.sum_squares(x))))
     with pytest.raises(ValueError, match="unique names"):
-        cone_program(cp.Problem(cp.Minimize(cp.sum(p @ x)), [cp.norm(x) <= 1]))
+        cone_program(cp.Problem(cp.Minimize(p @ x + q @ x), [cp.norm(x) <= 1]))
 
 
 def test_cones_have_one_name_in_all_versions():
