@@ -1,15 +1,18 @@
 """A test of back ends in a separate process: ``python -m formulations.backend_trial SECONDS KIND:NAME...``.
 
-Each back end solves programs of two unknowns with a known solution, and programs without a solution. The process prints
-one line for each back end. If a solver does not end in time, the process ends, because machine code cannot be stopped
-otherwise.
+Each back end solves programs of two unknowns with a known solution, and programs without a solution. It must print
+nothing. The process prints one line for each back end. If a solver does not end in time, the process ends, because
+machine code cannot be stopped otherwise.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
+import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from threading import Timer
 from typing import Any
@@ -52,6 +55,33 @@ def _conic_failure(name: str) -> str:
         apart = common(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [1.0, 0.0]]), np.full(2, 0.1))
         if apart.meet:
             return "it reports a common point of cones that do not meet"
+    return ""
+
+
+def _quadratic_failure(name: str) -> str:
+    """Return the failure of a solver of linear and quadratic programs, or "" if it works.
+
+    The solver must solve programs with a known solution, and must not report a solution of programs that have none.
+    """
+    import cvxpy as cp
+
+    from formulations.conic_solvers import solve_problem
+    from formulations.cvxpy_access import solves_quadratic_objectives
+
+    x = cp.Variable(2)
+    # a corner of a polygon, and the point of a half-plane that is nearest to a point outside of it
+    known = [(cp.Problem(cp.Minimize(-x[0] - 2 * x[1]), [x >= 0, x[0] + x[1] <= 1, x[1] <= 0.75]), [0.25, 0.75])]
+    if solves_quadratic_objectives(name):
+        known.append((cp.Problem(cp.Minimize(cp.sum_squares(x - _PLACE)), [cp.sum(x) == 1.0, x >= 0]), [0.45, 0.55]))
+    for problem, solution in known:
+        report = solve_problem(problem, name)
+        if report.outcome != "solved":
+            return f"it ends without a solution ({report.message or report.status})"
+        if np.abs(x.value - solution).max() > _NEAR:
+            return "its solution is wrong"
+    for rules in ([x >= 1, cp.sum(x) <= 1], [x <= 1]):
+        if solve_problem(cp.Problem(cp.Minimize(cp.sum(x)), rules), name).outcome == "solved":
+            return "it reports success for a program without a solution"
     return ""
 
 
@@ -101,11 +131,24 @@ def _solve(name: str, start: Array | None = None, ranges: Array = _RANGES, **con
 
 
 def _failure_of(kind: str, name: str) -> str:
-    """Return the failure of a solver of a kind, "conic" or "nonlinear", or "" if it works."""
+    """Return the failure of a solver of a kind, "conic", "quadratic" or "nonlinear", or "" if it works."""
+    tests = {"conic": _conic_failure, "quadratic": _quadratic_failure, "nonlinear": _nonlinear_failure}
     try:
-        return _conic_failure(name) if kind == "conic" else _nonlinear_failure(name)
+        return tests[kind](name)
     except Exception as trouble:  # noqa: BLE001  (any exception of a solver is its failure)
         return f"{type(trouble).__name__}: {trouble}".partition("\n")[0]
+
+
+def _printed(file: Any) -> bool:
+    """Return whether something was written to a file since the last call, and empty the file."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with suppress(OSError, AttributeError, TypeError):  # the C library's buffer, where the system has one for all
+        ctypes.CDLL(None).fflush(None)
+    some = os.fstat(file.fileno()).st_size > 0
+    file.seek(0)
+    file.truncate()
+    return some
 
 
 def main(seconds: float, choices: list[str]) -> None:
@@ -122,7 +165,6 @@ def main(seconds: float, choices: list[str]) -> None:
 
     def say(word: str, name: str, fault: str) -> None:
         """Print one result line."""
-        # solvers print to the same stream, perhaps without a line end
         lines.write(f"\n{word} {name} {fault}\n")
         lines.flush()
 
@@ -131,14 +173,21 @@ def main(seconds: float, choices: list[str]) -> None:
         say(FAILED, name, f"it does not end within {seconds:g} s on a program of two unknowns")
         os._exit(0)
 
-    for kind, _, name in (choice.partition(":") for choice in choices):
-        import_module("cvxpy" if kind == "conic" else "casadi")  # not counted as time of the solver
-        timer = Timer(seconds, stop, (name,))
-        timer.daemon = True
-        timer.start()
-        fault = _failure_of(kind, name)
-        timer.cancel()
-        say(FAILED if fault else PASSED, name, fault)
+    with tempfile.TemporaryFile() as output:
+        # what solvers print, from machine code too
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+        for kind, _, name in (choice.partition(":") for choice in choices):
+            import_module("casadi" if kind == "nonlinear" else "cvxpy")  # not counted as time of the solver
+            _printed(output)
+            timer = Timer(seconds, stop, (name,))
+            timer.daemon = True
+            timer.start()
+            fault = _failure_of(kind, name)
+            timer.cancel()
+            if _printed(output) and not fault:
+                fault = "it prints messages that no setting suppresses"
+            say(FAILED if fault else PASSED, name, fault)
 
 
 if __name__ == "__main__":

@@ -154,22 +154,18 @@ def _qoco(found: Any) -> Reading:
 
 
 def _osqp(found: Any) -> Reading:
-    """Return the numbers of a result of OSQP; its residuals are absolute. Versions before 1.0 report no gap."""
+    """Return the numbers of a result of OSQP; its residuals are absolute. Versions before 1.0.2 report no gap."""
     info = found.info
     gap = relative_gap(info.obj_val, info.dual_obj_val) if hasattr(info, "dual_obj_val") else np.nan
-    residuals = [getattr(info, new, getattr(info, old, np.nan)) for new, old in _OSQP_RESIDUALS]
-    return str(info.status), residuals[0], residuals[1], gap, info.iter, info.run_time
-
-
-# Names of the residuals from version 1.0 on, and before.
-_OSQP_RESIDUALS = (("prim_res", "pri_res"), ("dual_res", "dua_res"))
+    return str(info.status), info.prim_res, info.dual_res, gap, info.iter, info.run_time
 
 
 def _piqp(found: Any) -> Reading:
-    """Return the numbers of a result of PIQP; versions before 0.5 report absolute residuals."""
+    """Return the numbers of a result of PIQP; versions before 0.6 report absolute residuals under other names."""
     info = found.info
-    residuals = [getattr(info, f"{side}_res_rel", getattr(info, f"{side}_res", np.nan)) for side in ("primal", "dual")]
-    gap = relative_gap(info.primal_obj, info.dual_obj) if hasattr(info, "dual_obj") else np.nan
+    names = (("primal_res_rel", "primal_inf"), ("dual_res_rel", "dual_inf"))
+    residuals = [getattr(info, new) if hasattr(info, new) else getattr(info, old) for new, old in names]
+    gap = relative_gap(info.primal_obj, info.dual_obj)
     return info.status.name, residuals[0], residuals[1], gap, info.iter, info.run_time
 
 
@@ -178,7 +174,7 @@ def _highs(found: Any) -> Reading:
     info = found["info"]
     kinds = ("ipm", "crossover", "pdlp", "qp", "simplex")
     iterations = sum(max(0, getattr(info, f"{kind}_iteration_count", 0)) for kind in kinds)
-    # names and definitions of the gap differ between versions; before 1.8 there is none
+    # versions before 1.11 report no gap
     gap = _number(getattr(info, "primal_dual_objective_error", None))
     residuals = info.max_primal_infeasibility, info.max_dual_infeasibility
     return str(found["model_status"]), *residuals, gap, iterations, float(found["run_time"])

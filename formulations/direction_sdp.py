@@ -11,6 +11,10 @@ inequality, rays that meet behind the stations would be accepted). The problem i
 F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y =
 (1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
+Positions are no variables, and no linear or convex function of `v` gives a position. So a constraint on the position,
+for instance a half-plane, cannot be added here; limits of elevations can. The stations occur only in the directions of
+their base lines, so the unit of length has no effect.
+
 *Chordal* (a start without a guess): :math:`q_i = (u_i - v_i)^\top W_i (u_i - v_i)`, :math:`W_i = a_i a_i^\top /
 (\sigma_A \cos E)^2 + e_i e_i^\top / \sigma_E^2 + w_r u_i u_i^\top`. Its bound bounds the chordal cost only: on the
 sphere :math:`a^\top v = \cos E_v \sin\delta`, so the two costs differ to first order in :math:`\sigma \tan E`.

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, rank_ratio, tight
 from formulations.nls import Local, Program
+from formulations.unit_scale import PointScale
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,9 +153,10 @@ def lifted_ranges(
     right : array_like, shape (q,)
         Whitened z.
     station : array_like, shape (M, d)
-        Positions, numbers of order one.
+        Positions, in any unit of length.
     reach : float
-        Largest ``|x|`` allowed, ten extents of the array: range differences leave the lift unbounded without it.
+        Largest allowed distance of x from the mean of the stations, in extents of the array: range differences leave
+        the lift unbounded without it. The bound holds within this distance.
     backend : str
         Conic solver.
 
@@ -167,12 +169,15 @@ def lifted_ranges(
     -----
     Yang, Wang and Luo (2009). Built once per size and back end in each process.
     """
-    values, size, longest = lifted_data(rows, right, station, reach=reach)
-    count, dim = values["station"].shape
+    K, S = np.asarray(rows, dtype=np.float64), np.asarray(station, dtype=np.float64)
+    own = PointScale.of(S)
+    values, size, longest = lifted_data(K * own.unit, right, own.scaled(S), reach=reach)
+    count, dim = S.shape
     answer = _relaxation(count, dim, backend).solve(values, reach=longest)
     lift = answer.values["lift"]
     point, ranges = lift[0, 1 : 1 + dim].copy(), lift[0, 1 + dim :].copy()
     bound = max(answer.bound, 0.0) * size**2  # a sum of squares is not negative
+    point, ranges = own.back(point), own.unit * ranges
     return Lifted(point, ranges, answer.primal * size**2, bound, rank_ratio(lift), answer)
 
 

@@ -29,10 +29,11 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, tight
+from formulations.unit_scale import PointScale
 
 # Largest half-angle of a cone, radians: at pi/2 the cone is a half-space; here its tangent is 100.
 _WIDEST = 0.5 * np.pi - 0.01
-_RADIUS = 1e3  # radius of the region of a proof of emptiness, in the caller's units of order one
+_RADIUS = 1e3  # radius of the region of a proof of emptiness, in extents of the stations about their mean
 _EXACT = 1e-6  # level, in the caller's sigma, that counts as zero, since bisection would halve it forever
 # statuses of infeasible problems in Clarabel, and in cvxpy for all others; in lower case
 _SOLVED = ("solved", "almostsolved", "optimal", "optimal_inaccurate")
@@ -46,12 +47,12 @@ class Common:
     Parameters
     ----------
     point : Array, shape (d,)
-        Centre of the largest ball (of radius at most one) inside all cones; if they do not meet, the point that
-        violates them least.
+        Centre of the largest ball inside all cones, of a radius of at most about one extent of the stations; if they do
+        not meet, the point that violates them least.
     margin : float
         Radius of this ball. If the cones do not meet, minus the largest violation, which is similar to a distance.
     most : float
-        Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the origin.
+        Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the stations.
     meet : bool or None
         True if a check shows that `point` is in every cone; False if `most` is negative, which proves that no point is;
         None if neither could be shown.
@@ -99,7 +100,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     direction : array_like, shape (N, d)
         Measured unit directions.
     station : array_like, shape (N, d)
-        Positions, numbers of order one.
+        Positions, in any unit of length.
     bound : array_like, shape (N,)
         Largest possible angle to the true direction, radians, positive and below pi/2; an infinite value drops a cone.
     backend : str
@@ -115,13 +116,13 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     See the text of the module.
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation = _relaxation("ball", u.shape[0], u.shape[1], backend)
-    answer = relaxation.solve(_cone_data(u, S, theta, ball=True))
+    relaxation, own = _relaxation("ball", u.shape[0], u.shape[1], backend), _scale_of(S, theta)
+    answer = relaxation.solve(_cone_data(u, own.scaled(S), theta, ball=True))
     # the program minimises minus the radius
-    point, margin = answer.values["point"], -answer.primal
+    point, margin, most = own.back(answer.values["point"]), -answer.primal * own.unit, -answer.bound * own.unit
     inside = bool((angles(point, u, S) <= theta).all())
-    meet = True if inside else (False if -answer.bound < 0.0 else None)
-    return Common(point, margin, -answer.bound, meet, answer)
+    meet = True if inside else (False if most < 0.0 else None)
+    return Common(point, margin, most, meet, answer)
 
 
 def extent(
@@ -147,7 +148,8 @@ def extent(
     Lobo et al. (1998).
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation, data = _relaxation("edge", u.shape[0], u.shape[1], backend), _cone_data(u, S, theta, ball=False)
+    relaxation, own = _relaxation("edge", u.shape[0], u.shape[1], backend), _scale_of(S, theta)
+    data = _cone_data(u, own.scaled(S), theta, ball=False)
     out = []
     for line in np.asarray(towards, dtype=np.float64):
         answer = relaxation.solve({**data, "towards": -line})
@@ -155,7 +157,8 @@ def extent(
             out.append(np.inf)
         else:
             known = answer.status.lower() in _SOLVED
-            out.append((-answer.bound if np.isfinite(answer.bound) else -answer.primal) if known else np.nan)
+            most = (-answer.bound if np.isfinite(answer.bound) else -answer.primal) if known else np.nan
+            out.append(float(line @ own.origin) + own.unit * most)
     return np.array(out)
 
 
@@ -245,6 +248,12 @@ def _common_at_level(u: Array, S: Array, scale: Array, level: float, backend: st
 def _half_angles(scale: Array, level: float) -> Array:
     """Return half-angles (N,) that are `level` times `scale` (N,), at most `_WIDEST`; infinite for a dropped cone."""
     return np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
+
+
+def _scale_of(S: Array, theta: Array) -> PointScale:
+    """Return origin and unit of the stations S (N, d) whose angle bound `theta` (N,) is finite."""
+    held = np.isfinite(theta)
+    return PointScale.of(S[held] if held.any() else S)
 
 
 # The cone programs and their parameters.

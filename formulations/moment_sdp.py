@@ -221,7 +221,7 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
     Parameters
     ----------
     ranged : Ranged
-        The measurements, numbers of order one.
+        The measurements, in any unit of length: the box gives the units of the program.
     box : EnclosingBox
         The box, best from `formulations.range_enclosure.enclosure` with the same cost.
     cost : float

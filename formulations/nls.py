@@ -29,13 +29,18 @@ from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
 from formulations.backend import Choice, Ending, SolverError, count, first_sentence, hold_in_forks, record
-from formulations.nonlinear_solvers import nonlinear_report, status_of
+from formulations.nonlinear_solvers import nonlinear_report, silent, status_of
 from formulations.solver_report import SolverReport
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
 
 _QUIET = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "calc_lam_p": False}
+# CasADi's own solver of quadratic programs: others print, or end with an error where a program has no solution.
+_QRQP = {
+    "qpsol": "qrqp",
+    "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
+}
 # Options that suppress output of CasADi's solvers and keep their inner solvers from failing. The tolerance of IPOPT is
 # two decades below its default of 1e-8, because its solutions verify those of a Gauss-Newton iteration.
 _SILENCE: dict[str, dict[str, Any]] = {
@@ -44,12 +49,21 @@ _SILENCE: dict[str, dict[str, Any]] = {
         "print_header": False,
         "print_iteration": False,
         "print_status": False,
-        "qpsol": "qrqp",
-        "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
+        **_QRQP,
         "hessian_approximation": "exact",
         "convexify_strategy": "regularize",
     },
-    "blocksqp": {"print_header": False, "print_iteration": False},
+    "feasiblesqpmethod": {
+        "print_header": False,
+        "print_iteration": False,
+        "print_status": False,
+        **_QRQP,
+        "hessian_approximation": "exact",
+        "convexify_strategy": "regularize",
+    },
+    "qrsqp": {"print_header": False, "print_iteration": False, **_QRQP},
+    # updates that need no Schur complement: it needs a linear solver of HSL, which CasADi does not include
+    "blocksqp": {"print_header": False, "print_iteration": False, "schur": False, "hess_update": 2},
     "fatrop": {"fatrop": {"print_level": 0}},
     "uno": {"uno": {"logger": "SILENT"}},
 }
@@ -222,8 +236,9 @@ class Program:
         options = _options(choice, settings)
         broken = ca.vertcat(statement.equalities, ca.fmin(statement.inequalities, 0.0))
         self._check = ca.Function("check", [x, data], [ca.gradient(statement.f, x), broken])
-        solver = ca.nlpsol("nls", self._name, program, options)
-        faster = _compile(self._name, solver, options) if compiled else None
+        with silent(self._name):
+            solver = ca.nlpsol("nls", self._name, program, options)
+            faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
         self._solver = solver if faster is None else faster
         # CasADi releases the interpreter lock while it solves. The solver has one memory, which simultaneous threads
@@ -302,7 +317,7 @@ class Program:
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
         try:
-            with self.lock:
+            with self.lock, silent(self._name):
                 found, stats = self._solver(**given), self._solver.stats()
             status = status_of(stats)
         except RuntimeError as trouble:  # CasADi raises no other type

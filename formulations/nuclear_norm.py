@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep
 from formulations.low_rank_network import LowRank, Pulses, StationFactors
+from formulations.unit_scale import power_of_two
 
 # Change of the times of emission, in units of the spread, below which passes have converged: far below any noise.
 _SETTLED = 1e-7
@@ -116,7 +117,7 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     Parameters
     ----------
     z : array_like, shape (N, M)
-        All arrivals times the speed of propagation, near zero in each pulse and of order one; none is missing.
+        All arrivals times the speed of propagation, near zero in each pulse; none is missing.
     d : int
         Dimension of space, 2 or 3.
     passes : int
@@ -134,7 +135,9 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     -----
     Fazel (2002); Jiang, Kuang and Astrom (2013). Built once per size and back end in each process.
     """
-    Z = np.asarray(z, dtype=np.float64).T
+    given = np.asarray(z, dtype=np.float64)
+    unit = power_of_two(float(np.sqrt((given * given).mean())))
+    Z = given.T / unit
     m, n = Z.shape
     left, right = _centring_columns(m), _centring_columns(n)
     squares, factor = left.T @ (Z * Z) @ right, left.T @ Z
@@ -144,16 +147,16 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
         values = {"squares": squares, "factor": factor, "slope": slope, "most": Z.min(axis=0)}
         answer = relaxation.solve(values, bound=made == 1)
         offset = answer.values["offset"]
-        bound = answer.bound if made == 1 else bound
+        bound = answer.bound * unit**2 if made == 1 else bound
         G = squares - 2.0 * (factor * offset) @ right
         if not np.isfinite(G).all():
-            return NuclearNorm(offset, np.nan, bound, np.nan, made, answer)
+            return NuclearNorm(unit * offset, np.nan, bound, np.nan, made, answer)
         u, s, v = np.linalg.svd(G, full_matrices=False)
         if np.abs(offset - before).max() < _SETTLED:
             break
         # d/do of <W, G(o)>
         slope, before = -2.0 * np.einsum("pj,pq,jq->j", factor, u[:, :d] @ v[:d], right), offset
-    return NuclearNorm(offset, float(s.sum()), bound, float(s[d:].sum() / s.sum()), made, answer)
+    return NuclearNorm(unit * offset, float(s.sum()) * unit**2, bound, float(s[d:].sum() / s.sum()), made, answer)
 
 
 def affine_network(z: ArrayLike, offset: ArrayLike, d: int) -> LowRank:

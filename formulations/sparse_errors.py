@@ -38,6 +38,7 @@ from scipy.special import chdtri, erfc
 
 from formulations.algebra import Array
 from formulations.conic import ConicAnswer, Relaxation, keep, tight
+from formulations.unit_scale import power_of_two
 
 Groups = NDArray[np.intp]
 
@@ -259,10 +260,35 @@ def sparse_program(
     scale = max(float(np.abs(off).max()), 1.0)
     values = {"rows": left, "right": off / scale, "price": price / scale}
     for k, given in enumerate(cones):
-        moved = np.concatenate([given[:, :n] @ back, (given[:, :n] @ centre + given[:, n])[:, None] / scale], axis=1)
-        values[f"cone {k}"] = moved / np.abs(moved).max()  # a cone may be multiplied by a factor
+        light = _light_coordinates(given)
+        moved = np.concatenate([light[:, :n] @ back, (light[:, :n] @ centre + light[:, n])[:, None] / scale], axis=1)
+        cone = _balanced_cone(moved)
+        values[f"cone {k}"] = cone / np.abs(cone).max()  # a cone may be multiplied by a factor
     structure = (n, tuple(member.tolist()), tuple(len(c) - 1 for c in cones))
     return SparseProgram(structure, values, centre, scale * back, scale, member, price)
+
+
+# A cone |v| <= b with the last entry p of v: |(v_1, v_2, ..)|^2 <= (b + p)(b - p). A factor of one of these sums may go
+# to the other, which keeps the cone. In metres the two rows of |x|^2 <= w, w + 1 and w - 1, would be alike.
+
+
+def _light_coordinates(cone: Array) -> Array:
+    """Return a cone (p + 1, n + 1) with its last two rows replaced by their sum and their difference."""
+    light = cone.copy()
+    if len(cone) > 1:
+        light[-2], light[-1] = cone[-1] + cone[-2], cone[-1] - cone[-2]
+    return light
+
+
+def _balanced_cone(light: Array) -> Array:
+    """Return the cone (p + 1, n + 1) of rows from `_light_coordinates`, whose sum and difference have one size."""
+    cone = light.copy()
+    if len(light) > 1:
+        sum_, difference = (float(np.linalg.norm(row)) for row in light[-2:])
+        share = power_of_two(np.sqrt(difference / sum_)) if sum_ > 0.0 and difference > 0.0 else 1.0
+        first, second = share * light[-2], light[-1] / share
+        cone[-2], cone[-1] = 0.5 * (first - second), 0.5 * (first + second)
+    return cone
 
 
 def group_sizes(values: Array, groups: Groups, count: int) -> Array:

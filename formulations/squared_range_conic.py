@@ -122,7 +122,12 @@ def hull_problem(quadric: Quadric, change: Array | None = None) -> Any:
     factor = cp.Parameter((n + 1, n + 1), name="factor")
     w = cp.Variable(n, name="y")
     y = w if change is None else change[:, :n] @ w + change[:, n]
-    inside = cp.norm(y[:-1]) <= y[-1] if quadric.shape == "cone" else cp.sum_squares(y[:-1]) <= y[-1]
+    if quadric.shape == "cone":
+        inside = cp.norm(y[:-1]) <= y[-1]
+    elif change is None:
+        inside = cp.sum_squares(y[:-1]) <= y[-1]
+    else:
+        inside = _inside_paraboloid(change, w)
     # squared: a multiplier is then cost per unit of its constraint, and the residuals of the solver are small
     return cp.Problem(cp.Minimize(cp.sum_squares(factor[:, :n] @ w + factor[:, n])), [inside])
 
@@ -297,6 +302,20 @@ def crossings(factor: Array, y: Array, quadric: Quadric) -> Array:
         if abs(under) > _TIGHT * abs(over):
             out[i] = y + over / under * along
     return out
+
+
+def _inside_paraboloid(change: Array, w: Any) -> Any:
+    """Return the constraint ``|x|^2 <= y_n`` in the unknowns w (n,) with ``y = change (w, 1)``, divided by its slope.
+
+    The constants of both sides are almost equal, and their difference is a few standard deviations.
+    """
+    import cvxpy as cp
+
+    slope, centre = change[:, :-1], change[:, -1]
+    level = float(centre[:-1] @ centre[:-1] - centre[-1])
+    line = 2.0 * centre[:-1] @ slope[:-1] - slope[-1]
+    size = max(float(np.abs(line).max()), abs(level)) or 1.0
+    return cp.sum_squares((slope[:-1] / np.sqrt(size)) @ w) + (line / size) @ w + level / size <= 0.0
 
 
 def in_deviations(B: Array, g: Array) -> Array:

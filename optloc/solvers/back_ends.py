@@ -1,4 +1,4 @@
-"""Back ends that a study may use: conic solvers of cvxpy, nonlinear solvers of CasADi, least squares.
+"""Back ends: solvers of cvxpy (conic, quadratic), nonlinear solvers of CasADi, least squares.
 
 A library may list a solver that does not work. Some solvers end the process, and some raise an error for
 every program. Without a solution, some solvers never end, and some report a success. So each solver is tried once,
@@ -36,25 +36,36 @@ class Backend:
 
     Parameters
     ----------
-    kind : "conic", "nonlinear" or "least squares"
-        Programs that it solves.
+    kind : "conic", "quadratic", "nonlinear" or "least squares"
+        Programs that it solves; "quadratic" has linear and quadratic programs, but no cones.
     version : str
         Its version, or the version of the library that includes it.
     summary : str
         One line for listings.
     """
 
-    kind: Literal["conic", "nonlinear", "least squares"]
+    kind: Literal["conic", "quadratic", "nonlinear", "least squares"]
     version: str
     summary: str
 
 
 # Packages of solvers whose name in cvxpy differs.
-_PACKAGES = {"COPT": "coptpy", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy", "MOSEK": "Mosek", "SDPA": "sdpa-python"}
+_PACKAGES = {
+    "COPT": "coptpy",
+    "CUCLARABEL": "juliacall",
+    "GLOP": "ortools",
+    "GLPK": "cvxopt",
+    "GLPK_MI": "cvxopt",
+    "GUROBI": "gurobipy",
+    "MOSEK": "Mosek",
+    "PDLP": "ortools",
+    "SDPA": "sdpa-python",
+}
 _NONLINEAR = {
     "ipopt": "interior point with line search (Waechter, Biegler 2006)",
     "sqpmethod": "sequential quadratic programming with CasADi's qrqp",
     "feasiblesqpmethod": "feasible sequential quadratic programming",
+    "qrsqp": "sequential quadratic programming with line search and CasADi's qrqp",
     "blocksqp": "block-structured sequential quadratic programming (Janka et al. 2016)",
     "fatrop": "structured interior point",
     "alpaqa": "augmented Lagrangian with PANOC",
@@ -80,15 +91,16 @@ def installed() -> dict[str, Backend]:
     """Return every back end that its library lists, working or not; the key is the name in study files."""
     import casadi
     import cvxpy
-    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
+
+    from formulations.conic_solvers import adapter
+    from formulations.cvxpy_access import cones_of_solvers
 
     found: dict[str, Backend] = {}
-    # a solver with neither kind of cones cannot solve any program of this package
-    for name in sorted(set(cvxpy.installed_solvers()) & set(SOLVER_MAP_CONIC)):
-        cones = {cone.__name__.removeprefix("Svec") for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
-        powers = [word for word, cone in (("cones of order 2", "SOC"), ("semidefinite cones", "PSD")) if cone in cones]
-        if powers:
-            found[name] = Backend("conic", version_of(_PACKAGES.get(name, name.lower())), " and ".join(powers))
+    for name in sorted(set(cvxpy.installed_solvers()) & set(cones_of_solvers())):
+        one = adapter(name)
+        kind: Literal["conic", "quadratic"] = "conic" if one.cones & {"second-order", "semidefinite"} else "quadratic"
+        about = f"{one.solves()}: {one.summary}" if one.summary else one.solves()
+        found[name] = Backend(kind, version_of(_PACKAGES.get(name, one.package)), about)
     # CasADi has no list of plugins, so each name is tested
     for name, summary in _NONLINEAR.items():
         if casadi.has_nlpsol(name):
@@ -107,7 +119,7 @@ def backends() -> dict[str, Backend]:
 
 def kind_of(name: str) -> Literal["conic", "nonlinear"]:
     """Return the kind of programs that an installed back end solves, without a trial."""
-    return "conic" if installed()[name].kind == "conic" else "nonlinear"
+    return "nonlinear" if installed()[name].kind == "nonlinear" else "conic"
 
 
 def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
@@ -118,13 +130,17 @@ def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
     here = {key: entry.kind for key, entry in installed().items() if entry.kind != "least squares"}
     working = [key for key in backends() if key in here]
     if name not in here:
-        import cvxpy
+        from formulations.cvxpy_access import known_solvers
 
-        known = {*_NONLINEAR, *cvxpy.settings.SOLVERS} - set(here)
+        known = {*_NONLINEAR, *known_solvers()} - set(here)
         if name in known:
             advice = f"install it, or use one of {', '.join(working)}"
-            raise InvalidProblem(f"the solver {name!r} is not installed, or cannot solve these cones", where, advice)
+            raise InvalidProblem(f"the solver {name!r} is not installed", where, advice)
         raise InvalidProblem(f"unknown solver {name!r}", where, nearest(name, working))
+    if here[name] == "quadratic":
+        able = ", ".join(key for key in working if here[key] == "conic")
+        reason = f"the solver {name!r} solves {installed()[name].summary.partition(':')[0]}"
+        raise InvalidProblem(f"{reason}, and the methods of optloc need cones", where, f"use one of {able}")
     if name not in working:
         fault = faults_of(here)[name]
         raise InvalidProblem(

@@ -7,7 +7,7 @@ import pytest
 from formulations import conic
 from formulations.conic import Relaxation
 from formulations.squared_range import cone, minimiser, paraboloid
-from formulations.squared_range_conic import hull, shor
+from formulations.squared_range_conic import hull, hull_problem, shor
 
 
 def mixed_problem():
@@ -165,3 +165,51 @@ def test_a_tight_answer_has_no_other_points():
     found = shor(B, g, cone(3))
     assert found.rank_ratio < 1e-6
     assert np.isnan(found.points).all()
+
+
+def test_an_answer_has_the_report_and_the_duals_of_its_solve():
+    rng = np.random.default_rng(3)
+    data, tight = mixed_data(rng), {"tol_gap_rel": 1e-10, "tol_gap_abs": 1e-10, "tol_feas": 1e-10}
+    warm, fresh = Relaxation(mixed_problem(), settings=tight), mixed_problem()
+    for parameter in fresh.parameters():
+        parameter.value = data[parameter.name()]
+    fresh.solve(solver=cp.CLARABEL, **tight)
+    answer = warm.solve(data)
+    warm.solve(mixed_data(rng))  # a later solve does not change the duals of an answer
+    assert (answer.report.backend, answer.report.outcome) == ("CLARABEL", "solved")
+    assert answer.report.iterations == answer.iterations
+    assert answer.report.worst < 1e-7
+    assert answer.report.seconds > 0.0
+    assert len(answer.duals) == len(fresh.constraints)
+    for own, constraint in zip(answer.duals, fresh.constraints, strict=True):
+        theirs = constraint.dual_value
+        theirs = np.concatenate([np.ravel(part) for part in theirs]) if isinstance(theirs, list) else theirs
+        np.testing.assert_allclose(own, theirs, atol=1e-5)
+
+
+def test_another_back_end_has_a_report_and_duals_too():
+    x, p = cp.Variable(2, name="x"), cp.Parameter(2, name="p")
+    build = [cp.norm(x) <= 2.0, x >= p]
+    usual, other = (Relaxation(cp.Problem(cp.Minimize(cp.sum(x)), build), backend=name) for name in ("CLARABEL", "SCS"))
+    one, two = usual.solve({"p": np.zeros(2)}), other.solve({"p": np.zeros(2)})
+    assert (two.report.backend, two.report.outcome, two.status) == ("SCS", "solved", "optimal")
+    for own, theirs in zip(one.duals, two.duals, strict=True):
+        np.testing.assert_allclose(own, theirs, atol=1e-3)
+    none = other.solve({"p": np.full(2, 5.0)})
+    assert none.report.outcome == "infeasible"
+    assert none.duals == ()
+
+
+def test_a_multiplier_of_the_hull_is_cost_per_unit():
+    """The hull is posed with the squared norm: the derivative of the value by the right side of the cone."""
+    rng = np.random.default_rng(0)
+    B, g = rng.normal(size=(5, 3)), 2.0 * rng.normal(size=5)
+    problem, values = hull_problem(cone(2)), []
+    (y,), (factor,) = problem.variables(), problem.parameters()
+    factor.value = np.linalg.qr(np.column_stack([B, -g]), mode="r")
+    for step in (-1e-3, 0.0, 1e-3):
+        moved = cp.Problem(problem.objective, [cp.norm(y[:-1]) - y[-1] <= step])
+        moved.solve(solver=cp.CLARABEL, tol_gap_rel=1e-12, tol_gap_abs=1e-12, tol_feas=1e-12)
+        values.append((moved.value, float(moved.constraints[0].dual_value)))
+    assert values[1][1] > 0.0
+    assert (values[0][0] - values[2][0]) / 2e-3 == pytest.approx(values[1][1], rel=1e-4)

@@ -10,6 +10,7 @@ from optloc.solvers.back_ends import Backend, backend_kind, kind_of, try_in_proc
 HERE = {
     "CLARABEL": Backend("conic", "1", ""),
     "BROKEN": Backend("conic", "1", ""),
+    "OSQP": Backend("quadratic", "1", "linear and quadratic programs only: operator splitting"),
     "ipopt": Backend("nonlinear", "1", ""),
     "scipy": Backend("least squares", "1", ""),
 }
@@ -34,11 +35,36 @@ def test_a_back_end_has_the_kind_of_its_library(here):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("BROKEN", "does not work here: it never ends"), ("snopt", "is not installed"), ("ipop", "unknown solver")],
+    [
+        ("BROKEN", "does not work here: it never ends"),
+        ("snopt", "is not installed"),
+        ("ipop", "unknown solver"),
+        ("OSQP", "solves linear and quadratic programs only, and the methods of optloc need cones"),
+    ],
 )
 def test_what_cannot_be_used_is_refused_with_the_reason(here, name, words):
     with pytest.raises(InvalidProblem, match=words):
         backend_kind(name, "solver")
+
+
+def test_the_list_has_what_each_installed_solver_solves():
+    listed = back_ends.installed()
+    assert listed["CLARABEL"].kind == "conic"
+    for name in {"CLARABEL", "SCS"} & set(listed):
+        assert "second-order cone, semidefinite" in listed[name].summary
+    for name in {"OSQP", "HIGHS", "PIQP"} & set(listed):
+        assert listed[name].kind == "quadratic"
+        assert listed[name].summary.startswith("linear and quadratic programs only")
+    assert listed["SCIPY"].summary == "linear programs only"
+    assert "?" not in {entry.version for entry in listed.values()}
+
+
+def test_every_solver_of_linear_and_quadratic_programs_works_and_one_that_prints_does_not():
+    names = {name: entry.kind for name, entry in back_ends.installed().items() if entry.kind == "quadratic"}
+    assert try_in_process(names) == dict.fromkeys(names, "")
+    if "blocksqp" in back_ends.installed():
+        words = "it prints messages that no setting suppresses"
+        assert try_in_process({"blocksqp": "nonlinear", "ipopt": "nonlinear"}) == {"blocksqp": words, "ipopt": ""}
 
 
 def test_the_trial_goes_on_behind_a_solver_that_ends_its_process(monkeypatch):

@@ -15,6 +15,10 @@ from optloc.solvers.posing.statement import Relation
 
 # Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
 _SEED = 20261130
+# Statuses of Clarabel after which the factorisation may have lost its digits, and settings for a second attempt, as in
+# `formulations.conic`.
+_STOPPED = ("NumericalError", "InsufficientProgress")
+_REGULAR = {"static_regularization_constant": 1e-7}
 
 
 class ConvexProgram:
@@ -181,6 +185,8 @@ class ConvexProgram:
                 one.value = one.project(value)
         try:
             report = solve_problem(self.program, solver, own, warm=warm)
+            if report.status in _STOPPED and solver == "CLARABEL":
+                report = solve_problem(self.program, solver, {**_REGULAR, **own})
         except ValueError as trouble:
             raise InvalidProblem(str(trouble), "solver", "see 'optloc list solvers'") from None
         if warm and not takes:

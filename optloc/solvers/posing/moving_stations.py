@@ -27,6 +27,7 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
     The parameter "price" multiplies the mean squared distance from the array's centre, which is part of the objective.
     `locate` is not used.
     """
+    from formulations.conic import tight
     from formulations.registration_sdp import (
         RegistrationWindows,
         largest_rank_ratio,
@@ -73,6 +74,7 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
         residual=_window_residuals(data, every, n),
         read=read,
         rank_ratio=lambda: largest_rank_ratio({name: one.value for name, one in every.items()}, K),
+        settings=tight("CLARABEL", 1e-9),  # for duals; the method needs a start only, and keeps the default of 1e-8
     )
 
 
