@@ -29,6 +29,8 @@ HELD = 1e-13
 
 # Number of rays by dimension: the error of a probability is below 0.2 %, the error of a moment below 1 %.
 _RAYS = {2: 360, 3: 2500}
+# The same for rays on which the admitted parts are searched, which takes longer: errors are twice as large.
+_SEARCHED = {2: 240, 3: 800}
 # Number of nodes on a ray, and increase of the squared deviation at its end: 45 neglects a probability of 1e-10.
 _NODES, _END = 16, 45.0
 # Number of nodes on a ray for sorted values, and the share by which they shift from ray to ray (golden section).
@@ -242,7 +244,7 @@ class Truncated:
         factor = factor_of(self.covariance)
         rank = factor.shape[1]
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
-        unit, middle = _directions(rank), whitener @ self.shift
+        unit, middle = _directions(rank, self.region is not None), whitener @ self.shift
         step, lean = unit @ factor.T, unit @ middle
         # A ray ends where the squared deviation has increased by `_END`.
         length = lean + np.sqrt(lean**2 + _END)
@@ -431,7 +433,8 @@ def _gauss() -> tuple[Array, Array]:
     return 0.5 * (node + 1.0), 0.5 * weight
 
 
-@lru_cache(maxsize=4)
-def _directions(rank: int) -> Array:
-    """Return evenly distributed unit vectors (k, rank), the directions of the rays."""
-    return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(_RAYS[rank], rank)
+@lru_cache(maxsize=8)
+def _directions(rank: int, searched: bool) -> Array:
+    """Return evenly distributed unit vectors (k, rank), the directions of the rays; fewer if rays are searched."""
+    count = _SEARCHED if searched else _RAYS
+    return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(count[rank], rank)
