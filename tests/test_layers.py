@@ -34,8 +34,18 @@ NEIGHBOURS = {"sites", "plugins", "service", "lab"}
 LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
 USERS_OF_FORMULATIONS = {"solvers", "sites"}
 BASELINES = {"optloc.lab.study.baselines"}
-# clarabel: the back end of cvxpy, whose data a warm solve updates directly
-GROUND = {"numpy", "scipy", "cvxpy", "casadi", "clarabel", "formulations"} | sys.stdlib_module_names
+# clarabel: the back end of cvxpy, whose data a warm solve updates directly; cvxopt, highspy: optional back ends, whose
+# adapters call them because cvxpy drops the report of one and cannot silence the other
+GROUND = {
+    "numpy",
+    "scipy",
+    "cvxpy",
+    "casadi",
+    "clarabel",
+    "cvxopt",
+    "highspy",
+    "formulations",
+} | sys.stdlib_module_names
 
 
 def modules(root: Path) -> dict[str, Path]:
