@@ -113,7 +113,11 @@ def least_chordal(problem):
     def residual(x):
         line = x - station
         off = line / np.linalg.norm(line, axis=1, keepdims=True) - ahead
-        parts = (np.minimum(flat, steep) * (off * ahead).sum(1), flat * (off * across).sum(1), steep * (off * up).sum(1))
+        parts = (
+            np.minimum(flat, steep) * (off * ahead).sum(1),
+            flat * (off * across).sum(1),
+            steep * (off * up).sum(1),
+        )
         return np.concatenate(parts)
 
     starts = np.random.default_rng(1).uniform(-2.0, 2.0, (24, 3))

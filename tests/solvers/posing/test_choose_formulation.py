@@ -107,7 +107,14 @@ def test_what_cannot_be_posed_is_refused_by_a_sentence():
         pose(problem.flat().take(np.array([0, 0])), "nls")
     with pytest.raises(InvalidProblem, match="unknown formulation"):
         pose(problem, "hul")
-    for name in ("direction_sdp", "minimax_cone", "registration_sdp", "doppler_sdp", "range_height_conic", "nuclear_norm"):
+    for name in (
+        "direction_sdp",
+        "minimax_cone",
+        "registration_sdp",
+        "doppler_sdp",
+        "range_height_conic",
+        "nuclear_norm",
+    ):
         with pytest.raises(InvalidProblem):
             pose(problem, name)
     with pytest.raises(InvalidProblem, match="squared ranges need ranges"):
@@ -118,6 +125,8 @@ def test_what_cannot_be_posed_is_refused_by_a_sentence():
     known = replace(problem, motions=(Motion(known=np.zeros((1, 1, 2))),))
     with pytest.raises(InvalidProblem, match="nothing is unknown"):
         pose(known, "nls")
-    two = assemble(np.eye(3)[:, :2], measured("range", np.ones(3), a=np.arange(3), sigma=1.0), motions=(Motion(), Motion()))
+    two = assemble(
+        np.eye(3)[:, :2], measured("range", np.ones(3), a=np.arange(3), sigma=1.0), motions=(Motion(), Motion())
+    )
     with pytest.raises(InvalidProblem, match="does not cover"):
         pose(two, "squared_range_conic: shor")
