@@ -401,7 +401,7 @@ def solve_with_status(
             cvxpy_access.clear_values(problem)
             word = "" if isinstance(trouble, cvxpy.error.SolverError) else f"{type(trouble).__name__}: "
             report = SolverReport(solver, "error", message=f"{word}{first_sentence(trouble)}")
-            return report, str(cvxpy.settings.SOLVER_ERROR)
+            return report, "solver_error"
         report = _report(one, raw, status, problem, form)
         if report.outcome == "failed":
             cvxpy_access.clear_values(problem)

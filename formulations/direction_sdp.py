@@ -89,7 +89,7 @@ def directions(
     sigma : array_like, shape (N, 2)
         Standard deviations, positive.
     station : array_like, shape (N, 3)
-        Positions, numbers of order one.
+        Positions, in any unit of length.
     axes : array_like, shape (N, 3, 3), optional
         Rows are the unit vectors of each station's axes.
     radial : float

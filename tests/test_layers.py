@@ -34,8 +34,18 @@ NEIGHBOURS = {"sites", "plugins", "service", "lab"}
 LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
 USERS_OF_FORMULATIONS = {"solvers", "sites"}
 BASELINES = {"optloc.lab.study.baselines"}
-# clarabel: the back end of cvxpy, whose data a warm solve updates directly
-GROUND = {"numpy", "scipy", "cvxpy", "casadi", "clarabel", "formulations"} | sys.stdlib_module_names
+# clarabel: the back end of cvxpy, whose data a warm solve updates directly; cvxopt, highspy: optional back ends, whose
+# adapters call them because cvxpy drops the report of one and cannot silence the other
+GROUND = {
+    "numpy",
+    "scipy",
+    "cvxpy",
+    "casadi",
+    "clarabel",
+    "cvxopt",
+    "highspy",
+    "formulations",
+} | sys.stdlib_module_names
 
 
 def modules(root: Path) -> dict[str, Path]:
@@ -153,7 +163,7 @@ def test_no_loose_module():
 
 
 # Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
-MODULES, LINES, BODY, RECURRING = 483, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 484, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -7,8 +7,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
+from formulations.backend import Choice, recording, using
 from formulations.conic_solvers import SOLVERS, adapter, refusal, solve_problem, solve_with_status
 from formulations.solver_report import SolverReport
+from formulations.squared_range import paraboloid
+from formulations.squared_range_conic import shor
 
 MODULES = {"HIGHS": "highspy"}
 AT = np.array([1.0, 2.0, 3.0])
@@ -174,6 +177,16 @@ def test_solvers_of_quadratic_programs_refuse_cones_in_one_sentence(name):
         solve_problem(second_order(), name)
     assert refusal(second_order(), name).startswith(words)
     assert refusal(quadratic(), name) == ""
+
+
+@pytest.mark.parametrize("name", each(["OSQP"]))
+def test_a_relaxation_reports_the_refusal_as_its_ending(name):
+    with using(Choice("conic", name)), recording() as endings:
+        found = shor(np.eye(3), np.ones(3), paraboloid(2))
+    assert np.isnan(found.y).all()
+    assert found.answer.status == "solver_error"
+    assert found.answer.message.startswith(f"{name} solves linear and quadratic programs only, and this problem has")
+    assert [str(ending) for ending in endings] == [f"{name}: {found.answer.message}"]
 
 
 def test_solvers_that_are_unknown_or_missing_are_refused(monkeypatch):

@@ -1,12 +1,20 @@
 """Origins and units: exact changes of variables, and bounds that hold in any unit of length."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from often import few
+from ranged import drawn, minimum
 
+from formulations.doppler_sdp import doppler
 from formulations.lifted import lifted_ranges
 from formulations.minimax_cone import common, extent, minimax
+from formulations.moment_sdp import moment_bound
 from formulations.nuclear_norm import nuclear_offsets
+from formulations.range_enclosure import enclosure
+from formulations.range_height import Ellipsoid
+from formulations.range_height_conic import lift
 from formulations.sparse_errors import sparse_fit, square_cone
 from formulations.squared_range import cone, minimiser, paraboloid
 from formulations.squared_range_conic import hull, shor
@@ -136,3 +144,43 @@ def test_other_formulations_do_not_depend_on_the_unit(seed):
     base = all_of_them(1.0)
     for unit in (1e-3, 1e3, 1e6):
         np.testing.assert_allclose(all_of_them(unit), base, rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
+def test_formulations_that_scale_their_own_numbers(unit):
+    """Moments in a box, Doppler shifts, a fix on an ellipsoid: the same answer, and no bound above a point's cost."""
+    rng = np.random.default_rng(4)
+    ranged, truth = drawn(rng, "difference", 5, 2, 1e-3)
+    x, cost = minimum(ranged, truth, rng)
+    larger = replace(
+        ranged, station=ranged.station * unit, offset=ranged.offset * unit, covariance=ranged.covariance * unit**2
+    )
+    boxes = enclosure(ranged, x, cost + 0.1), enclosure(larger, x * unit, cost + 0.1)
+    assert None not in boxes
+    base, found = moment_bound(ranged, boxes[0], cost + 0.1), moment_bound(larger, boxes[1], cost + 0.1)
+    assert found.bound <= cost + 1e-9 * (1.0 + cost)
+    assert found.bound == pytest.approx(base.bound, abs=1e-5)
+
+    place, speed, source = rng.uniform(-1, 1, (7, 2)), rng.normal(size=(7, 2)), rng.uniform(-3, 3, 2)
+    away = source - place
+    rate = -(away * speed).sum(1) / np.linalg.norm(away, axis=1)
+    rates = np.eye(7)[1:] - np.eye(7)[0]
+    z, white = rates @ rate + 1e-3 * rng.normal(size=6), np.eye(6) / 1e-3
+
+    def start(scale):
+        return doppler(place * scale, speed * scale, z * scale, white / scale, ranges=np.zeros((6, 7)), rates=rates)
+
+    base, found = start(1.0), start(unit)
+    np.testing.assert_allclose(found.point / unit, base.point, rtol=1e-3, atol=1e-3)
+    assert found.bound == pytest.approx(base.bound, rel=1e-3, abs=1e-3)
+
+    satellites = np.array([[1.2, 0.1, 0.1], [1.15, -0.3, 0.2], [1.1, 0.2, -0.4]])
+    fix = np.array([0.98, 0.05, 0.0]) / np.linalg.norm([0.98, 0.05, 0.0])
+    offset = np.linalg.norm(fix - satellites, axis=1)
+    near = satellites.mean(0) / np.linalg.norm(satellites.mean(0))
+    for scale in (1.0, unit):
+        surface = Ellipsoid(np.eye(3) / scale**2, np.zeros(3))
+        lifted = lift(satellites * scale, np.ones(3), (offset - offset[0]) * scale, surface, near * scale)
+        np.testing.assert_allclose(lifted.x / scale, fix, atol=1e-5)
+        cost = ((fix - near) ** 2).sum() + (offset[0] - np.linalg.norm(near - satellites[0])) ** 2
+        assert lifted.bound / scale**2 <= cost + 1e-8
