@@ -196,7 +196,9 @@ def bend_along(problem: Problem, face: Face, equations: Normal, along: Array, x:
         for j in np.flatnonzero((gradients != 0.0).any((0, 1))):
             size = _STEP * (1.0 + np.abs(x[:, j]))
             moved = [x + np.where(np.arange(x.shape[1]) == j, sign * size[:, None], 0.0) for sign in (1.0, -1.0)]
-            slope = (levels(problem, face, moved[0])[1] - levels(problem, face, moved[1])[1]) / (2.0 * size[:, None, None])
+            slope = (levels(problem, face, moved[0])[1] - levels(problem, face, moved[1])[1]) / (
+                2.0 * size[:, None, None]
+            )
             bend[:, :, j] = (share[..., None] * slope).sum(1)
         bend = 0.5 * (bend + np.swapaxes(bend, -1, -2))
         inner = np.swapaxes(along, -1, -2) @ bend @ along

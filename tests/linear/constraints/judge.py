@@ -30,7 +30,9 @@ def drawn(rng, d):
         stations[:, 2] = rng.uniform(0.0, 300.0, count)
     truth = np.append(rng.uniform(0.0, 1000.0, 2), rng.uniform(20.0, 300.0, d - 2))
     sigma, angle = rng.uniform(4.0, 20.0), rng.uniform(0.005, 0.03)
-    kinds = [("range",), ("tdoa",), ("tdoa", "azimuth"), ("range", "azimuth"), ("azimuth",)][rng.integers(5 if d == 2 else 3)]
+    kinds = [("range",), ("tdoa",), ("tdoa", "azimuth"), ("range", "azimuth"), ("azimuth",)][
+        rng.integers(5 if d == 2 else 3)
+    ]
     rows, parts = [], []
     for kind in kinds:
         if kind == "tdoa":
@@ -195,7 +197,9 @@ def any_of(rng, truth):
 
     makers, members, outside = [disc, half_plane, polyhedron, annulus], [], []
     for _ in range(int(rng.integers(2, 5))):
-        member, depth = makers[rng.integers(4)](rng, truth + np.append(60.0 * rng.standard_normal(2), [0.0] * (len(truth) - 2)))
+        member, depth = makers[rng.integers(4)](
+            rng, truth + np.append(60.0 * rng.standard_normal(2), [0.0] * (len(truth) - 2))
+        )
         members.append(tuple(member))
         outside.append(depth)
     return (AnyOf(tuple(members)),), lambda p: np.min([depth(p) for depth in outside], axis=0)
@@ -235,14 +239,37 @@ def keep_out_and_box(rng, truth):
 PLANE = {
     maker.__name__: maker
     for maker in (
-        half_plane, band, disc, annulus, keep_out_disc, ball, keep_out_ball, polygon, keep_out_polygon, polyhedron,
-        polyline, any_of, keep_out_and_box,
+        half_plane,
+        band,
+        disc,
+        annulus,
+        keep_out_disc,
+        ball,
+        keep_out_ball,
+        polygon,
+        keep_out_polygon,
+        polyhedron,
+        polyline,
+        any_of,
+        keep_out_and_box,
     )
 }
-SPACE = {f"{maker.__name__} in space": maker for maker in (
-    half_plane, disc, keep_out_disc, ball, keep_out_ball, keep_out_polygon, polyhedron, polyline, road_in_space,
-    above_terrain, any_of,
-)}
+SPACE = {
+    f"{maker.__name__} in space": maker
+    for maker in (
+        half_plane,
+        disc,
+        keep_out_disc,
+        ball,
+        keep_out_ball,
+        keep_out_polygon,
+        polyhedron,
+        polyline,
+        road_in_space,
+        above_terrain,
+        any_of,
+    )
+}
 ALL = {name: (maker, 2) for name, maker in PLANE.items()} | {name: (maker, 3) for name, maker in SPACE.items()}
 
 
