@@ -400,7 +400,7 @@ def chordal_program(
 
 
 def _program(frame: Array, S: Array, cost: _Cost) -> DirectionProgram:
-    """Return the data for a quadratic cost in the frames (N, 3, 3) of the reference directions; S (N, 3) are stations."""
+    """Return the data for a quadratic cost in the frames (N, 3, 3) of reference directions; S (N, 3) are stations."""
     count = len(S)
     # w in units in which the largest tangent weight is one; otherwise the lift of errors of a milliradian would vanish
     size = float(cost.square[:, 1:].max()) or 1.0

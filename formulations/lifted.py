@@ -75,7 +75,7 @@ def lifted_problem(count: int, dim: int, change: Array | None = None) -> Any:
     -------
     cvxpy.Problem
         Variable ``lift`` of shape (1 + d + M, 1 + d + M) of u; parameters ``gram`` (1 + M, 1 + M), the products of
-        ``[-z, K]`` in these unknowns; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
+        ``[-z, K]`` in these unknowns; ``station`` (M, d) and ``square`` (M,), the squared lengths; ``reach``, the
         largest ``|x|^2``, without which range differences leave the lift unbounded.
 
     Notes

@@ -250,7 +250,8 @@ def moment_bound(ranged: Ranged, box: EnclosingBox, cost: float, *, backend: str
 def _forms(ranged: Ranged, box: EnclosingBox, unit: Array) -> tuple[Array, Array, Array]:
     """Return the coefficients of the relaxation: first equality, other equalities, and whitened residuals.
 
-    The first equality is a matrix in (1, s, t), the residuals are linear in (1, t, omega). The others are rows (M - 1, d + 5)
+    The first equality is a matrix in (1, s, t), the residuals are linear in (1, t, omega). The others are rows (M - 1,
+    d + 5)
     of ``1, s, t, w_i, t w_i, w_i^2``. `unit` (M - 1,) are the units of the errors w.
     """
     from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]

@@ -220,7 +220,7 @@ class Program:
         """
         changed = cls.__new__(cls)
         changed.n, changed.m, changed.p, changed.diagonal = program.n, program.m, program.p, program.diagonal
-        changed._prepare(statement, choice, settings or {}, compiled=False)
+        changed._prepare(statement, choice, settings or {}, compiled=False)  # noqa: SLF001  (own class)
         return changed
 
     def _prepare(
@@ -332,13 +332,13 @@ class Program:
         status = f"{status}, but {against}" if against else status
         success = bool(stats["success"]) and not against
         record(Ending(self._name, status, "", success))
-        multipliers = _numbers(found["lam_g"])
+        reached = _numbers(found["lam_g"])
         return Local(
             x=_numbers(found["x"]),
             cost=float(found["f"]),
             bounds=_numbers(found["lam_x"]),
-            equalities=multipliers[: self._equal],
-            inequalities=multipliers[self._equal :],
+            equalities=reached[: self._equal],
+            inequalities=reached[self._equal :],
             status=status,
             success=success,
             iterations=iterations,

@@ -262,7 +262,8 @@ class RegistrationWindows:
     @property
     def weight(self) -> Array:
         """Return the form (n, n) of the mean of |p_k|^2 over the windows, which the price multiplies."""
-        return np.kron(self.power.T @ self.power / len(self.station), np.eye(len(self.origin)))
+        mean = self.power.T @ self.power / len(self.station)
+        return np.asarray(np.kron(mean, np.eye(len(self.origin))), dtype=np.float64)
 
     def bias(self, shift: Any) -> Any:
         """Return the biases (b,) in the units of the caller from scaled shifts, an array or an expression."""

@@ -16,7 +16,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
 from optloc.solvers.posing.gross_errors import pose_sparse
 from optloc.solvers.posing.moving_stations import pose_doppler, pose_registration
-from optloc.solvers.posing.programs import pose_program
+from optloc.solvers.posing.programs import pose_program, pose_pulses
 from optloc.solvers.posing.range_moments import pose_heights, pose_lifted, pose_moments
 from optloc.solvers.posing.sight_lines import pose_directions, pose_minimax
 from optloc.solvers.posing.squared_ranges import pose_hull, pose_shor
@@ -293,6 +293,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "never with the nuclear norm alone; truncated, it is exact without noise if its passes converge",
         "0.5 s for 12 stations and 20 pulses",
         "Fazel 2002; Jiang, Kuang, Astrom 2013",
+        pose=pose_pulses,
     ),
     "nls": Formulation(
         "weighted nonlinear least squares with bounds, equalities and inequalities (IPOPT)",

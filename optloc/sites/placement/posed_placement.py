@@ -106,7 +106,9 @@ class PosedPlacement:
         """
         label = name or f"constraint {1 + len(self._convex.relations)}"
         if label in self._convex.relations:
-            raise InvalidProblem(f"there is already a constraint {label!r}", "name", "give each constraint its own name")
+            raise InvalidProblem(
+                f"there is already a constraint {label!r}", "name", "give each constraint its own name"
+            )
         self._convex.relations[label] = self._convex.relation(constraint, label)
         self._convex.restate()
 

@@ -98,10 +98,8 @@ class ConvexProgram:
                 f"the constraint {name!r} is not convex by cvxpy's rules", "constraint", "use the formulation 'nls'"
             )
         if isinstance(constraint, kinds.SOC | kinds.PSD):
-            unit = float(np.max(np.concatenate([self.units(one) for one in constraint.args])))
-            return Relation(
-                name, (type(constraint)(*(one / unit for one in constraint.args)),), (np.array(unit),), True
-            )
+            unit = np.asarray(np.max(np.concatenate([self.units(one) for one in constraint.args])))
+            return Relation(name, (type(constraint)(*(one / float(unit) for one in constraint.args)),), (unit,), True)
         if isinstance(constraint, kinds.Inequality | kinds.Equality):
             left, equal = constraint.expr, isinstance(constraint, kinds.Equality)
         elif isinstance(constraint, kinds.NonNeg | kinds.NonPos | kinds.Zero):

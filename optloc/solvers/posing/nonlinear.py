@@ -420,22 +420,23 @@ class PosedProgram(Posed):
         return dict(zip(self.relations, np.split(numbers.ravel(), cut), strict=True))
 
     def _residuals(self, found: Local) -> tuple[float, float, float]:
-        """Return primal residual, dual residual relative to the gradients, and complementarity of a local solution."""
+        """Return primal residual, relative dual residual and relative complementarity of a local solution.
+
+        The gradient is relative to its largest term. For least squares, these are the products of rows and residuals.
+        """
         import casadi as ca
 
-        x, state = self._base.x, self._statement
-        rows = ca.Function(
-            "rows",
-            [x, self._base.p],
-            [ca.gradient(state.f, x), ca.jacobian(state.g, x), state.equalities, state.inequalities],
-        )
-        slope, turn, equal, more = (one.full() for one in rows(found.x, self.parameters))
+        x, state, white = self._base.x, self._statement, self._base.white
+        terms = 2.0 * ca.fabs(ca.jacobian(white, x)).T @ ca.fabs(white) if not self.own_objective else ca.SX(0)
+        parts = [ca.gradient(state.f, x), ca.jacobian(state.g, x), state.equalities, state.inequalities, terms]
+        rows = ca.Function("rows", [x, self._base.p], parts)(found.x, self.parameters)
+        slope, turn, equal, more, size_of_terms = (one.full() for one in rows)
         multipliers = np.concatenate([found.equalities, found.inequalities])
-        terms = turn.T @ multipliers if len(multipliers) else np.zeros(len(slope))
-        size = 1.0 + max(np.abs(slope).max(initial=0.0), np.abs(terms).max(initial=0.0), abs(found.cost))
+        pull = turn.T @ multipliers if len(multipliers) else np.zeros(len(slope))
+        size = 1.0 + max(np.abs(part).max(initial=0.0) for part in (slope, pull, size_of_terms))
         primal = max(np.abs(equal).max(initial=0.0), -np.minimum(more, 0.0).min(initial=0.0))
         gap = float(np.abs(found.inequalities * more.ravel()).sum()) / (1.0 + abs(found.cost))
-        return float(primal), float(np.abs(slope.ravel() + terms + found.bounds).max() / size), gap
+        return float(primal), float(np.abs(slope.ravel() + pull + found.bounds).max() / size), gap
 
     def _explain_failure(self, found: Local, answer: PosedAnswer) -> Fix:
         """Return a fix without an answer and its reason, from the status of the solver."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from optloc.base.errors import InvalidProblem
 from optloc.linear.normal import with_station_noise
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import Locate
+from optloc.solvers.posing.statement import ConicStatement, Locate
 from optloc.solvers.scaled_program import ScaledProblem
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import is_registration_run
@@ -23,3 +24,12 @@ def pose_program(problem: Problem, locate: Locate) -> ScaledProblem:
     if is_registration_run(problem) and problem.epochs >= 2 * BLOCKS:
         free = average_blocks(free, BLOCKS)
     return ScaledProblem(with_station_noise(free), shared=False)
+
+
+def pose_pulses(problem: Problem, locate: Locate) -> ConicStatement:
+    """Raise InvalidProblem: the nuclear norm states networks whose stations and pulses have no known position."""
+    raise InvalidProblem(
+        "the nuclear norm states networks of stations at unknown positions",
+        "formulation",
+        "use optloc.sites.calibration.pose_network",
+    )

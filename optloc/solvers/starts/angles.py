@@ -7,6 +7,7 @@ the bearings of all problems.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -215,7 +216,7 @@ def by_directions(seen: Bearings) -> Array:
     return seen.metres(out)
 
 
-def sights(seen: Bearings, i: int, use: Array) -> dict[str, Array | None]:
+def sights(seen: Bearings, i: int, use: Array) -> dict[str, Any]:
     """Return the arguments of `formulations.direction_sdp.directions` for the bearings `use` (m,) of problem i."""
     axes = None if seen.axes is None else seen.axes[i, use]
     angle, sigma = seen.angle[i, use], 1.0 / seen.weight[i, use]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -167,7 +168,7 @@ class LimitedRows:
         The ellipsoid of a known height, Earth-centred as the positions then are.
     """
 
-    given: dict[str, Array]
+    given: dict[str, Any]
     column: Array
     surface: Ellipsoid | None
 

@@ -1,11 +1,17 @@
 """What every posed problem has to meet, measured on one random problem of a formulation at a random scale."""
 
+from functools import partial
 from inspect import signature
 
 import numpy as np
+from scipy.optimize import least_squares
 from solvers.posing.scenes import METHODS, SCENES
 
 from optloc import constraints, pose, solve
+from optloc.linear.least_squares_ranges import ranges
+from optloc.linear.vectors import problem_at_rest
+from optloc.solvers.starts.angles import bearings, complete_bearings, sights
+from optloc.solvers.starts.squared_range import hull, last_weighting, shor
 
 # Steps of the difference quotient, in standard deviations of the position: large where the value has few digits, and
 # small where it has kinks.
@@ -41,7 +47,7 @@ def fenced(formulation, seed):
     smooth : bool
         Whether quotients of two steps agree: at a kink and at rounding there is no derivative to compare.
     """
-    problem, d = drawn(formulation, seed), None
+    problem = drawn(formulation, seed)
     base, fix = pose(problem, formulation).solve(refine=False), solve(problem)
     d = problem.stations.dimension
     rng = np.random.default_rng(seed)
@@ -69,80 +75,68 @@ def fenced(formulation, seed):
 
 
 def above_multi_start(formulation, seed):
-    """Return by how much bound and value exceed the least cost of the same program over many points; negative if not.
+    """Return by how much bound and value exceed the least posed cost over many points, relative to one plus this cost.
 
-    The judge evaluates the posed cost itself: at random points of the quadric for squared ranges, and at the
-    maximum-likelihood fix and points around it for the bounds of the likelihood.
+    The judge evaluates the cost itself at points, and knows nothing of the relaxation.
     """
     problem = drawn(formulation, seed)
-    posed = pose(problem, formulation)
-    found = posed.solve(refine=False).posed
-    least = least_cost(posed, problem, formulation)
-    return max(found.bound, found.value) - least, 1.0 + abs(least)
+    found = pose(problem, formulation).solve(refine=False).posed
+    least = LEAST[formulation](problem.flat())
+    return (np.nanmax([found.bound, found.value]) - least) / (1.0 + abs(least))
 
 
-def least_cost(posed, problem, formulation):
-    """Return the least posed cost over a multi-start with SciPy that knows nothing of the relaxation."""
-    from scipy.optimize import least_squares
+def least_squared(problem, pick):
+    """Return the least squared-range cost over starts around the stations, by SciPy on the rows."""
+    alone = problem_at_rest(problem)
+    squared, rows, right = last_weighting(alone, ranges(alone), pick)
+    cone = squared.quadric.shape == "cone"
 
-    if formulation in ("moment_sdp", "lifted"):
-        return float(solve(problem, "searched").cost)
-    rows = squared_rows_of(posed)
-    centre, unit = posed.origin, posed.unit
-    best = np.inf
-    rng = np.random.default_rng(1)
-    for start in [*rng.uniform(-3.0, 3.0, (24, len(centre)))]:
-        end = least_squares(rows, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        best = min(best, 2.0 * end.cost)
-    assert unit > 0.0
-    return best
+    def residual(x):
+        length = np.linalg.norm(x)
+        return rows[0] @ np.append(x, length if cone else length**2) - right[0]
+
+    starts = np.random.default_rng(1).uniform(-3.0, 3.0, (12, problem.dimension))
+    return min(2.0 * least_squares(residual, x, xtol=1e-15, ftol=1e-15, gtol=1e-15).cost for x in starts)
 
 
-def squared_rows_of(posed):
-    """Return the residuals of squared ranges as a function of the scaled position, from the expressions of a pose."""
-    constant, slope = affine(posed.residual, posed)
-    place, turn = affine(posed.position, posed)
-    cone = "range" in posed.statement.parts
-    last_at, last_turn = affine(posed.range, posed) if cone else (None, None)
-    quadric = posed.statement
+def least_chordal(problem):
+    """Return the least chordal cost of directions over starts around the stations, by SciPy."""
+    seen = bearings(problem_at_rest(problem))
+    given = sights(seen, *complete_bearings(seen)[0])
+    angle, sigma, station = given["angle"], given["sigma"], given["station"]
+    across = np.stack([-np.sin(angle[:, 0]), np.cos(angle[:, 0]), 0.0 * angle[:, 0]], axis=1)
+    level = np.stack([np.cos(angle[:, 0]), np.sin(angle[:, 0])], axis=1)
+    ahead = np.concatenate([np.cos(angle[:, 1:]) * level, np.sin(angle[:, 1:])], axis=1)
+    up = np.cross(ahead, across)
+    flat, steep = 1.0 / (sigma[:, 0] * np.cos(angle[:, 1])), 1.0 / sigma[:, 1]
 
-    def rows(x):
-        return quadric_rows(x)
+    def residual(x):
+        line = x - station
+        off = line / np.linalg.norm(line, axis=1, keepdims=True) - ahead
+        parts = (
+            np.minimum(flat, steep) * (off * ahead).sum(1),
+            flat * (off * across).sum(1),
+            steep * (off * up).sum(1),
+        )
+        return np.concatenate(parts)
 
-    def quadric_rows(x):
-        r = np.linalg.norm(x)
-        y = np.append(x, r if cone else r * r)
-        # the unknowns w of the program from y, by the two affine maps
-        stack = np.concatenate([turn / posed.unit, (last_turn / posed.unit if cone else LAST(posed))])
-        shift = np.concatenate([(place - posed.origin) / posed.unit, (last_at / posed.unit if cone else LAST0(posed))])
-        w = np.linalg.solve(stack, y - shift)
-        return constant + slope @ w
-
-    assert quadric is not None
-    return rows
-
-
-def LAST(posed):
-    return posed.last[:, :-1]
+    starts = np.random.default_rng(1).uniform(-2.0, 2.0, (24, 3))
+    return min(2.0 * least_squares(residual, x, xtol=1e-15, ftol=1e-15, gtol=1e-15).cost for x in starts)
 
 
-def LAST0(posed):
-    return posed.last[:, -1]
+def least_likely(problem):
+    """Return the least maximum-likelihood cost that a search from many positions finds."""
+    return float(solve(problem, "searched").cost[0])
 
 
-def affine(expression, posed):
-    """Return constant (m,) and matrix (m, n) of an affine expression of the first moments of the program."""
-    lift = posed.statement.program.variables()[0]
-    shape = lift.shape
-    n = shape[0] - (1 if len(shape) == 2 else 0)
-    before = lift.value
-    values = []
-    for k in range(n + 1):
-        w = np.zeros(n) if k == 0 else np.eye(n)[k - 1]
-        lift.value = w if len(shape) == 1 else np.outer(np.append(w, 1.0), np.append(w, 1.0))
-        values.append(np.ravel(expression.value))
-    lift.value = before
-    return values[0], np.stack([one - values[0] for one in values[1:]], axis=1)
+LEAST = {
+    "squared_range_conic: shor": partial(least_squared, pick=shor),
+    "squared_range_conic: hull": partial(least_squared, pick=hull),
+    "direction_sdp": least_chordal,
+    "moment_sdp": least_likely,
+    "lifted": least_likely,
+    "nls": least_likely,
+}
 
 
 def apart_from_method(formulation, seed):
