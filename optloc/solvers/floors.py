@@ -13,6 +13,7 @@ from optloc.base.types import Array, Band, Status, first_status
 from optloc.problem.claims import GLOBAL, UNKNOWN, Claims
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
+from optloc.solvers.certificates.branch_and_bound import claim_sentence
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.solvers.solution import solve
 
@@ -84,9 +85,15 @@ def _judged(chosen: Fix, fixes: Sequence[Fix], gap: Array) -> Fix:
     claims = chosen.claims
     least = np.where(open_floor, 0.0, np.minimum(claims.margin, margin.min(axis=0)))
     weaker = open_floor & (claims.proof == GLOBAL)
+    # The sentence of a proof names its margin and the number of the alternatives.
+    listed = np.isfinite(chosen.alternatives.gap).sum(axis=1)
+    sentence = claims.reason.astype(object)
+    for i in np.flatnonzero((claims.proof == GLOBAL) & claims.unique & ~weaker):
+        sentence[i] = claim_sentence(float(least[i]), int(listed[i]), None)
+    sentence[weaker] = "the fix on another floor is not proven"
     changed = Claims(
         np.where(weaker, UNKNOWN, claims.proof),
-        np.where(weaker, "the fix on another floor is not proven", claims.reason),
+        sentence,
         claims.method, claims.bound, claims.gap, claims.unique & ~open_floor, least, claims.boxes, claims.region,
         claims.asked,
     )  # fmt: skip
