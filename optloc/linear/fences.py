@@ -64,8 +64,8 @@ _CHEBYSHEV = (
     1.210237189224279e-16,
 )
 _ROOT_HALF, _HAZARD_AT_ZERO = np.sqrt(0.5), np.sqrt(2.0 / np.pi)
-# Margin below which ``u + w`` has fewer than eight digits, and the expansion 1 - 1/u^2 of the second derivative more.
-_FAR_OUTSIDE = -1e4
+# Margin below which rounding of ``u + w`` exceeds the error 1e-10 of the expansion 1 - 1/u^2 + 6/u^4 of ``w (u + w)``.
+_FAR_OUTSIDE = -100.0
 # Sweeps over several fences, and change of a site in standard deviations at which they end: each sweep wins a digit.
 _SWEEPS, _SETTLED = 50, 1e-9
 # Share of the information across a fence that the rows must have. With less, only the fence limits the target, and on
@@ -143,7 +143,8 @@ def derivatives_of_margin(u: Any) -> tuple[Any, Any]:
     t, series = _series(_ROOT_HALF * outside)
     w = xp.where(u >= 0.0, within, _HAZARD_AT_ZERO / (t * xp.exp(series)))
     far = u < _FAR_OUTSIDE
-    return w, xp.where(far, 1.0 - 1.0 / xp.where(far, u, -1.0 + 0.0 * u) ** 2, w * (u + w))
+    small = 1.0 / xp.where(far, u, -1.0 + 0.0 * u)
+    return w, xp.where(far, 1.0 - small * small * (1.0 - 6.0 * small * small), w * (u + w))
 
 
 def _choose(u: Any) -> Callable[[Any, Any, Any], Any]:

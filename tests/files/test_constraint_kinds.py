@@ -195,11 +195,11 @@ def test_file_and_python_give_the_same_fix(kind, tmp_path):
     keys, _, wanted, settings = CASES[kind]
     from_file = load(written(tmp_path, document(f'kind = "{kind}"\n{keys}', **settings)))
     found = solve(from_file, "gtrs+lsr")
-    assert np.isfinite(found.position).all()
+    assert np.isfinite(found.x).all()
     assert float(violation(from_file, found.x[None])[0]) < 1e-6
     if wanted is not None:
         other = solve(dataclasses.replace(from_file, constraints=tuple(wanted), fences=()), "gtrs+lsr")
-        np.testing.assert_allclose(found.position, other.position, atol=1e-6)
+        np.testing.assert_allclose(found.x, other.x, atol=1e-6)
         assert found.status == other.status
 
 
@@ -266,8 +266,12 @@ def test_missing_and_unknown_keys():
         check_keys("disc", {"x", "y"}, "here")
     with pytest.raises(InvalidProblem, match="annulus has no key 'radius'"):
         check_keys("annulus", {"x", "y", "radius"}, "here")
-    with pytest.raises(InvalidProblem, match="disc has no values; give x, y, radius or lat_deg, lon_deg, radius"):
-        check_keys("disc", set(), "here")
+    with pytest.raises(InvalidProblem, match="disc has no centre; give x, y or lat_deg, lon_deg"):
+        check_keys("disc", {"radius"}, "here")
+    with pytest.raises(InvalidProblem, match="terrain has no bound; give exactly or min or max"):
+        check_keys("terrain", {"file"}, "here")
+    with pytest.raises(InvalidProblem, match="polyline has no shape; give points or points_deg or file"):
+        check_keys("polyline", {"tolerance"}, "here")
     check_keys("above-ground", set(), "here")
 
 

@@ -24,6 +24,7 @@ from optloc.linear.constraints.levels import (
     is_corner as is_corner,
     is_flat as is_flat,
     is_height as is_height,
+    kind_of as kind_of,
     levels as levels,
     on_face as on_face,
     outwards as outwards,

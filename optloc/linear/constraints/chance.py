@@ -21,6 +21,8 @@ from optloc.problem.truncated import Truncated
 
 # Decimal digits of an integrated probability: one more than its accuracy, and far above the rounding of a processor.
 _DIGITS = 4
+# Points that are tested at a time: their distances from a polygon of a hundred edges take some tens of megabytes.
+_PART = 2**13
 
 
 def chance(fix: Fix, region: Any) -> Array:
@@ -157,5 +159,6 @@ def _gaussian(shift: Array, covariance: Array) -> Truncated:
 def _share(frame: Problem, points: Array, weight: Array, known: Array | bool = True) -> float:
     """Return the share of the weights (p,) that belongs to points (p, d) in the region; `known` (p,) are usable."""
     with np.errstate(all="ignore"):
-        inside = violation(frame, points) <= 0.0
+        parts = [violation(frame, points[i : i + _PART]) <= 0.0 for i in range(0, len(points), _PART)]
+    inside = np.concatenate(parts)
     return float(np.round((weight * (inside & known)).sum() / weight.sum(), _DIGITS))
