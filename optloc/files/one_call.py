@@ -36,6 +36,7 @@ from optloc.models.medium import Medium
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.solvers.floors import solve_on_floors
 from optloc.solvers.solution import solve
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ _SURFACE = 6.3e6
 _PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
 # Quantities whose bounds determine the level of a target.
 _LEVELS = ("height", "terrain")
+# Length of a band of heights: the least and the greatest.
+_BAND = 2
 # Largest rounding of an instant as a float, as a share of its standard deviation; less has no effect.
 _STEP = 0.1
 
@@ -98,7 +101,7 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
@@ -121,7 +124,7 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
@@ -143,7 +146,7 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
@@ -187,9 +190,9 @@ def locate(
         Unit of the values: "ns", "km", "rad" and others.
     reference : str, optional
         Reference station of time differences; by default the first.
-    height : float, str, or (least, greatest), optional
+    height : float, str, (least, greatest), set or list, optional
         Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z if the
-        frame is not on Earth.
+        frame is not on Earth. A set, or a list of three or more, has the floors on one of which the target is.
     constraints : sequence of constraints or mappings, optional
         Constraints of `optloc.constraints`, or tables as in problem files, such as
         ``{"kind": "disc", "lat": 47.1, "lon": 8.2, "radius": "2 km"}``.
@@ -242,10 +245,13 @@ def locate(
     north = _North(azimuth, declination)
     _check_north(north, given)
     wave = wave_of(renamed("speed", speed, "wave_speed", wave_speed))
-    problem, labels = _problem_of(
-        stations, latlon, given, sigma, unit, reference, height, constraints, frame, wave, north
-    )
-    return _labelled(solve(problem, method=method), labels)
+    floors = _floors(height)
+    made = [
+        _problem_of(stations, latlon, given, sigma, unit, reference, level, constraints, frame, wave, north)
+        for level in floors or [height]
+    ]
+    fix = solve_on_floors([problem for problem, _ in made], method) if floors else solve(made[0][0], method=method)
+    return _labelled(fix, made[0][1])
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
@@ -380,6 +386,16 @@ def _constraints(
     if height is None and level:
         return stated, motions
     return found({"height": _heights(height, places, given)})
+
+
+def _floors(height: Any) -> list[Any]:
+    """Return the floors of the argument `height`: the heights of a set, or of a list of three or more; else none."""
+    several = isinstance(height, set | frozenset) or (isinstance(height, list | tuple) and len(height) > _BAND)
+    if not several:
+        return []
+    if not height:
+        raise InvalidProblem("there are no heights", "height", "give the heights of the floors, such as {0.0, 3.5}")
+    return sorted(height, key=str) if any(isinstance(each, str) for each in height) else sorted(height)
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:

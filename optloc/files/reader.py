@@ -94,6 +94,8 @@ class Loaded:
         Interpretation of a measurement table, as a JSON value; empty for a problem file.
     speed : str
         Wave speed, as text; empty if no value depends on it.
+    floors : tuple of float
+        Heights, metres, on one of which the target is; empty without such a list.
     """
 
     problem: Problem
@@ -108,6 +110,7 @@ class Loaded:
     azimuths: str = ""
     table: Mapping[str, Any] = field(default_factory=dict)
     speed: str = ""
+    floors: tuple[float, ...] = ()
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""

@@ -304,7 +304,8 @@ def wind_of(given: str | Sequence[float], where: str) -> tuple[float, ...]:
             raise InvalidProblem(f"{given!r} is not a wind", where, advice)
         size = float(Units("speed").conversion(strength[2], where).to_si(float(strength[1])))
         turn = np.radians(float(bearing[1]))
-        return float(-size * np.sin(turn)), float(-size * np.cos(turn))
+        # a wind from the west has no exact zero towards the north; the last digits of a sine have no meaning
+        return tuple(round(float(-size * part), 12) + 0.0 for part in (np.sin(turn), np.cos(turn)))
     try:
         parts = tuple(float(part) for part in given.split(","))
     except ValueError:
