@@ -30,6 +30,7 @@ from optloc.files.measurements import (
     with_baseline,
     with_declination,
 )
+from optloc.files.phases import combined_noise, split_phases
 from optloc.files.propagation import medium_in, speed_bias, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import (
@@ -250,6 +251,7 @@ def assemble(
     # Convert excess paths to path sums now, since the station positions are known.
     chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
+    chunks, index, target = split_phases(chunks, index, target, source)
     if azimuths:
         azimuths += declination_text(chunks)
     rows, numbers = _rows(chunks, index, target)
@@ -410,8 +412,10 @@ def noise_of(
 
     `numbers`, `epochs` and `targets` are the global row number, epoch and target (m,) of each row, for each chunk.
     """
-    blocks: list[Block] = []
+    blocks = combined_noise(chunks, numbers)
     for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
+        if chunk.combination is not None:
+            continue
         if chunk.sigma is not None:
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
         elif chunk.arrival is not None:

@@ -55,7 +55,7 @@ def uses_of(
     """
     out = {name: one.form.kind for one in found for name in one.columns}
     long = len(out) == len(found)  # a table with one reading in each row has one column for each sort
-    picks = any(one.form.value == "sp" for one in found)
+    picks = any(one.form.value in ("sp", "picks") for one in found)
     # The roles of S minus P: columns of P and S, a column of their difference, or columns of phase and time.
     by_phase = picks and roles.find("sp") is None and not (roles.find("p") and roles.find("s"))
     wanted = ["phase"] if by_phase else ["sp"] if roles.find("sp") is not None else ["p", "s"]
