@@ -289,9 +289,10 @@ def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
 
     `given` has the values of the table options. Raise InvalidProblem for a problem file with such options.
     """
+    from optloc.files.csv_formats import is_log
     from optloc.files.table_import import ColumnHints
 
-    if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
+    if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()) or is_log(file):
         return ColumnHints(**given)
     stated = [name for name, value in given.items() if value]
     if stated:

@@ -37,6 +37,7 @@ from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
 from optloc.files.table_import import (
     CONVENTIONS,
     ColumnHints,
+    Form,
     Named,
     Readings,
     as_angles,
@@ -52,7 +53,7 @@ from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
 
-INPUTS = ("arrivals", "picks", "sp", "pseudoranges", "stations")
+INPUTS = ("arrivals", "picks", "sp", "excess", "pseudoranges", "stations")
 
 # File endings of orbits. With --times, each file is read as orbits.
 _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
@@ -126,11 +127,11 @@ def _check_hints(hints: ColumnHints) -> None:
 
 
 def _sort(word: str) -> str:
-    """Return the sort of readings for a word of --as: "arrivals", "picks", "sp", or a measurement kind.
+    """Return the sort of readings for a word of --as: "arrivals", "picks", "sp", "excess", or a measurement kind.
 
     Raise InvalidProblem for an unknown word, or a kind without stations.
     """
-    if word in ("arrivals", "picks", "sp"):
+    if word in ("arrivals", "picks", "sp", "excess"):
         return word
     try:
         kind = kind_named(word, "--as")
@@ -191,6 +192,7 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
             raise InvalidProblem("the station positions are unknown", "--stations", advice)
         stations, receivers = read_inline(roles, hints)
     forms = [sort_named(name) for name in sorts]
+    roles = _with_transmitters(roles, forms, stations)
     return _plan(
         roles,
         hints,
@@ -231,6 +233,20 @@ def _is_long(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> bool:
         return False
     # If receivers have columns of readings, a time column is the time of these readings, not a reading.
     return bool({*sorts_of(roles, hints)} - {"times"})
+
+
+def _with_transmitters(roles: Roles, forms: Sequence[Form], stations: ColumnPlaces) -> Roles:
+    """Return roles in which the column of transmitters is the second station of sums of ranges.
+
+    A column such as "transmitter" names targets in other tables. Here it names stations, if all its cells are stations.
+    """
+    if not all(form.kind == "range_sum" for form in forms) or roles.find("reference") is not None:
+        return roles
+    found = next((role for role in ("transmitter", "target") if roles.find(role) is not None), None)
+    if found is None or not holds_names(roles.table, roles.column(found), stations.names):
+        return roles
+    kept = {role: column for role, column in roles.by_role.items() if role != found}
+    return replace(roles, by_role={**kept, "reference": roles.column(found)})
 
 
 def _unknown(roles: Roles, hints: ColumnHints) -> InvalidProblem:
@@ -383,6 +399,7 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
+    lines += ["excess = true"] if found.form.value == "excess" else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
         # As in `optloc.locate`, differences share the errors of their stations, each with half of the variance.

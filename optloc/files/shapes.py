@@ -316,12 +316,7 @@ def _checked(
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
                 raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, stations.names))
     if found.b is not None:
-        same = np.flatnonzero(found.a == found.b)
-        if len(same):
-            spot = table.at(int(found.row[same[0]]))
-            raise InvalidProblem(
-                f"{found.form.kind} names station {found.a[same[0]]!r} twice", spot, "name two stations"
-            )
+        found = _without_reference(found, table)
     found = _with_digits(found, table)
     columns = [column for key, column in epochs_of(roles, hints, [found]).items()]
     _, epoch = equal_rows(columns, table.count)
@@ -338,6 +333,25 @@ def _checked(
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=hints.positive or positive or "a-farther")
     return _with_convention(found, hints, stations, table.source) if found.form.kind == "azimuth" else found
+
+
+def _without_reference(found: Readings, table: Table) -> Readings:
+    """Return differences without the rows of the reference station to itself, whose values are zero.
+
+    Raise InvalidProblem for such a row with another value, or if no other row exists.
+    """
+    same = np.asarray(found.a) == np.asarray(found.b)
+    wrong = np.flatnonzero(same & ((found.values.units != 0) | (found.form.kind != "tdoa")))
+    if len(wrong) or same.all():
+        item = int(wrong[0]) if len(wrong) else 0
+        spot = table.at(int(found.row[item]))
+        raise InvalidProblem(f"{found.form.kind} names station {found.a[item]!r} twice", spot, "name two stations")
+    if not same.any():
+        return found
+    names = ", ".join(dict.fromkeys(np.asarray(found.a)[same].tolist()))
+    count = int(same.sum())
+    note = f"{count} zero reading{'s' if count > 1 else ''} of the reference station {names} to itself are left out"
+    return replace(found.take(np.flatnonzero(~same)), notes=(*found.notes, note))
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.

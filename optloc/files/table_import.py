@@ -59,13 +59,14 @@ class Form:
 _SPECIAL_FORMS = {
     "arrivals": Form("toa", "toa", "arrival times"),
     "times": Form("toa", "time", "arrival times"),
+    "excess": Form("range_sum", "excess", "paths by way of the target, in excess of the direct path"),
     "picks": Form("toa", "picks", "arrivals of P and S waves"),
     "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
 }
 
 
 def sort_named(name: str) -> Form:
-    """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "picks", "sp" or a kind."""
+    """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "excess", "picks", "sp" or a kind."""
     return _SPECIAL_FORMS[name] if name in _SPECIAL_FORMS else Form(name, name, MODELS[name].summary)
 
 
@@ -97,8 +98,8 @@ class ColumnHints:
         Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; for
         several kinds "range=10 cm,azimuth=2 deg".
     what : str, optional
-        Content of the table: "arrivals", "picks" (P and S), "sp" (S minus P alone), "pseudoranges", "stations" or a
-        measurement kind; by default from the column names.
+        Content of the table: "arrivals", "picks" (P and S), "sp" (S minus P alone), "excess" (bistatic path minus the
+        direct path), "pseudoranges", "stations" or a measurement kind; by default from the column names.
     columns : mapping of str to str
         Column of each role whose name is not clear; "set+msg" joins two columns.
     ignore : tuple of str
@@ -375,6 +376,7 @@ def sorts_of(roles: Roles, hints: ColumnHints) -> list[str]:
     if roles.find("station") and (all(map(roles.find, ("time", "phase"))) or all(map(roles.find, ("p", "s")))):
         return ["picks"]
     fitting = [name for name in _KINDS_BY_NAME if roles.find(name)]
+    fitting += ["excess"] if roles.find("excess") and "range_sum" not in fitting else []
     fitting += ["arrivals"] if roles.find("toa") else []
     if fitting or not (roles.find("station") and roles.find("time")):
         return fitting
