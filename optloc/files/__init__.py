@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         write_text as write_text,
         written as written,
     )
+    from optloc.files.convert import load_table as load_table
     from optloc.files.measurements import (
         Context as Context,
         ends_of as ends_of,

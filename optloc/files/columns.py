@@ -94,7 +94,7 @@ _FIXED = {
     "sp": _role("time from P to S", "sp sminusp spdifference stmp tstp", _CLOCK),
     "excess": _role(
         "path by way of the target minus the direct path",
-        "excess excesspath pathexcess excessdelay excessrange bistaticexcess bistaticdelay bistaticexcessrange", _LENGTHS,
+        "excess excesspath pathexcess excessdelay excessrange bistaticexcess bistaticdelay", _LENGTHS,
     ),
     "heading": _role(
         "heading of the vehicle, added to its bearings",

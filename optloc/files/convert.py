@@ -52,6 +52,7 @@ from optloc.files.table_problem import Converted, Section, TableProblem, no_sigm
 from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
+from optloc.problem.problem import Problem
 
 INPUTS = ("arrivals", "picks", "sp", "excess", "pseudoranges", "stations")
 
@@ -111,6 +112,35 @@ def convert(
     # Read before writing, so that an invalid problem is not written.
     loaded = table_problem.read()
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
+
+
+def load_table(source: str | Path, **options: Any) -> Problem:
+    """Return the problem of a file of readings, as ``optloc fix`` reads it.
+
+    The format is recognised by the content: a table, HYPO71 or NonLinLoc picks, QuakeML, opensoundscape events, RINEX
+    and the others that `convert` reads.
+
+    Parameters
+    ----------
+    source : str or Path
+        File of readings.
+    **options
+        Fields of `ColumnHints`, such as ``stations="net.csv"``, ``sigma="0.1 s"``, ``vp="6 km/s"`` and
+        ``vs="3.5 km/s"``.
+
+    Raises
+    ------
+    InvalidProblem
+        The message names the file, the row and the column.
+    """
+    paths = {name: Path(options[name]) for name in ("stations", "navigation", "times") if options.get(name) is not None}
+    known = [*ColumnHints.__dataclass_fields__]
+    unknown = next((name for name in options if name not in known), None)
+    if unknown is not None:
+        raise InvalidProblem(f"there is no option {unknown!r}", unknown, nearest(unknown, known))
+    hints = ColumnHints(**(options | paths))
+    _check_hints(hints)
+    return interpret_table(Path(source), hints).read().problem
 
 
 def _check_hints(hints: ColumnHints) -> None:

@@ -24,6 +24,8 @@ from optloc.files.table_import import ColumnHints
 
 # Relative spread of vp / vs in a table up to which its mean is used without a note: the rounding of two decimals.
 _EQUAL = 0.005
+# Usual ratio vp / vs of rock, the square root of 3, for an advice.
+_USUAL = 1.73
 # The surface of the layers is rounded up to this step, so that no station is above it by rounding, metres.
 _STEP = 100.0
 
@@ -86,7 +88,7 @@ def crust_of(hints: ColumnHints, *, with_s: bool) -> Crust:
     Raise InvalidProblem for a missing speed, and for P waves that are not faster than S waves.
     """
     if hints.vp is None:
-        advice = "state them, such as --vp '6 km/s' --vs '3.5 km/s', or --vp crust.csv with columns depth_km, vp, vs"
+        advice = "state both, such as --vp '6 km/s' --vs '3.5 km/s', or a table of layers with --vp crust.csv"
         raise InvalidProblem("the speeds of the P and S waves are unknown", "--vp", advice)
     if Path(hints.vp).suffix.lower() in (".csv", ".tsv", ".txt"):
         return _of_table(Path(hints.vp), hints, with_s)
@@ -94,7 +96,8 @@ def crust_of(hints: ColumnHints, *, with_s: bool) -> Crust:
     if not with_s:
         return Crust(None, vp, note=f"P waves have {vp:.6g} m/s (straight rays)")
     if hints.vs is None:
-        raise InvalidProblem("the speed of the S waves is unknown", "--vs", f"state it; vp / 1.73 is {vp / 1.73:.0f} m/s")
+        advice = f"state it; vp / 1.73 is {vp / _USUAL:.0f} m/s"
+        raise InvalidProblem("the speed of the S waves is unknown", "--vs", advice)
     vs = _speed(hints.vs, "--vs")
     _check(vp, vs, "--vs")
     note = f"P waves have {vp:.6g} m/s and S waves {vs:.6g} m/s (straight rays), with one origin time"

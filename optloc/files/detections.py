@@ -1,8 +1,8 @@
 """Tables of sound events that opensoundscape writes: arrivals of each event at its receivers.
 
 Source: S. Lapp and others, "OpenSoundscape", Methods in Ecology and Evolution 14 (2023), with the tables of
-`events_to_df` and `positions_to_df`. A delay is the arrival at a receiver minus the arrival at the first receiver of the
-event, seconds.
+`events_to_df` and `positions_to_df`. A delay is the arrival at a receiver minus the arrival at the first receiver of
+the event, seconds.
 """
 
 from __future__ import annotations
@@ -62,4 +62,5 @@ def sound_events(text: str, source: str) -> Table:
 def clips(text: str, source: str) -> Table:
     """Raise InvalidProblem: detections in clips have no arrival times. `text` is not used."""
     what = "these are detections in clips, which have no arrival times"
-    raise InvalidProblem(what, source, "estimate delays with localize_detections of opensoundscape, and give events_to_df")
+    advice = "estimate delays with localize_detections of opensoundscape, and give its events_to_df"
+    raise InvalidProblem(what, source, advice)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -70,13 +71,15 @@ def split_phases(
     `index` and `target` are the epoch and target of the rows of `chunks`. A chunk with phases becomes one chunk for
     each kind of its combinations. Raise InvalidProblem for phases without standard deviations.
     """
-    out: tuple[list[RowChunk], list[Array], list[Array]] = ([], [], [])
+    made: list[RowChunk] = []
+    epochs: list[Array] = []
+    targets: list[Array] = []
     for chunk, epoch, label in zip(chunks, index, target, strict=True):
         parts = [(chunk, np.arange(len(epoch)))] if chunk.vp_vs is None else _combined(chunk, epoch, label, source)
-        for part, rows in parts:
-            for entries, value in zip(out, (part, epoch[rows], label[rows]), strict=True):
-                entries.append(value)  # type: ignore[arg-type]
-    return out
+        made += [part for part, _ in parts]
+        epochs += [epoch[rows] for _, rows in parts]
+        targets += [label[rows] for _, rows in parts]
+    return made, epochs, targets
 
 
 def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list[tuple[RowChunk, Array]]:
@@ -98,15 +101,15 @@ def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list
     made, events, variance = [], event[present], chunk.sigma[present] ** 2
     for rows in sets:
         first = present[rows.arrival[:, 0]]
-        columns = {name: rows.combine(getattr(chunk, name)[present]) for name in ("z", "correction")}
-        of_first = {
+        columns: dict[str, Any] = {name: rows.combine(getattr(chunk, name)[present]) for name in ("z", "correction")}
+        columns |= {
             name: None if (values := getattr(chunk, name)) is None else values[first]
             for name in ("row", "weight", "slope", "baseline", "label", "time", "written", "target")
         }
         combination = Combination(rows, events, variance)
         part = replace(
             chunk, kind=rows.kind, a=rows.a, b=rows.b, sigma=None, vp_vs=None, combination=combination,
-            **columns, **of_first,
+            **columns,
         )  # fmt: skip
         made.append((part, first))
     return made

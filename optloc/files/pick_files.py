@@ -28,10 +28,12 @@ _UNUSED = "4"
 # Characters of a line that a message shows.
 _SHOWN = 60
 
-HYPO71 = re.compile(rb"(?:[ \t]*\r?\n)*[A-Z0-9]{2,4} {0,2}[IE ?]?P[ UDCN+?-]?[0-4 ] ?\d{6}[ \d]{4}[ \d]{2}[.\d][ \d]{2}")
+HYPO71 = re.compile(
+    rb"(?:[ \t]*\r?\n)*(?=[A-Z0-9 ]{4})[A-Z0-9]{2,4} *[IE? ]P[ UDCN+?-][0-4 ].\d{6}[ \d]{4}[ \d]{2}[.\d][ \d]{2}"
+)
 """Start of a HYPO71 phase file: station, onset, P, first motion, weight, date, hour, minute and seconds."""
 NONLINLOC = re.compile(
-    rb"(?:\s*(?:#|PUBLIC_ID|EQEVENT|EQ_EVENT)[^\n]*\n)*\s*\S+[ \t]+\S+[ \t]+\S+[ \t]+[iea-z?]{1}[ \t]+\S+[ \t]+\S{1}[ \t]+"
+    rb"(?:\s*(?:#|PUBLIC_ID|EQEVENT|EQ_EVENT)[^\n]*\n)*\s*\S+[ \t]+\S+[ \t]+\S+[ \t]+[A-Za-z?][ \t]+\S+[ \t]+\S[ \t]+"
     rb"\d{8}[ \t]+\d{1,4}[ \t]+-?\d*\.?\d+[ \t]+[A-Z]{3}\b"
 )
 """Start of a NonLinLoc observation file: comments, then a line with nine columns and the type of the error."""
@@ -73,11 +75,13 @@ def _card(line: str, where: str) -> Iterator[tuple[Row, str]]:
         parts = [int(line[i : i + 2].replace(" ", "0")) for i in range(9, 19, 2)]
         year = parts[0] + (1900 if parts[0] >= _CENTURY else 2000)
         # Hour 24 and minute 60 occur, because cards of one event share the minute.
-        minute = datetime(year, parts[1], parts[2]) + timedelta(hours=parts[3], minutes=parts[4])
+        day = datetime(year, parts[1], parts[2])  # noqa: DTZ001  (UTC, as all times of picks)
+        minute = day + timedelta(hours=parts[3], minutes=parts[4])
         p, s = (_seconds(line[first:last]) for first, last in ((19, 24), (31, 36)))
     except (ValueError, OverflowError):
         what = f"{line[:_SHOWN].rstrip()!r} is not a phase card"
-        raise InvalidProblem(what, where, "write station, P remark, date and seconds in the columns of HYPO71") from None
+        advice = "write station, P remark, date and seconds in the columns of HYPO71"
+        raise InvalidProblem(what, where, advice) from None
     if remark[1:2].upper() == "P" and p is not None:
         yield {"station": station, "phase": "P", "time": _date(minute, p)}, remark[3:4].strip()
     if line[37:38].upper() == "S" and s is not None:
@@ -140,7 +144,7 @@ def quakeml(text: str, source: str) -> Table:
         raise InvalidProblem("QuakeML needs the package obspy, which is not installed", source, advice) from None
     try:
         catalog = read_events(BytesIO(text.encode()), format="QUAKEML")
-    except Exception as error:  # obspy and lxml raise many types for an invalid document
+    except Exception as error:  # noqa: BLE001  (obspy and lxml raise many types for an invalid document)
         reason = " ".join(str(error).split())[:_SHOWN]
         raise InvalidProblem(f"obspy cannot read it ({reason})", source, "check that the file is complete") from None
     rows: list[Row] = []
@@ -154,8 +158,8 @@ def quakeml(text: str, source: str) -> Table:
             if pick.evaluation_status == "rejected" or not phase or not station or pick.time is None:
                 unknown += 1
                 continue
-            error = pick.time_errors.uncertainty if pick.time_errors else None
-            sigma = float(error) if error else None
+            deviation = pick.time_errors.uncertainty if pick.time_errors else None
+            sigma = float(deviation) if deviation else None
             rows.append({"event": number, "station": station, "phase": phase, "time": str(pick.time), "sigma_s": sigma})
     notes = [f"{unknown} picks that are rejected, or without phase or station, are left out"] if unknown else []
     return _table(rows, source, notes)

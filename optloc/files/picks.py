@@ -126,7 +126,7 @@ def _check_order(picks: list[Pick], keys: list[tuple[str, str]], roles: Roles) -
             first[keys[row]] = min(time, first.get(keys[row], time))
     early = next((row for row, wave, time, _ in picks if wave == "S" and time <= first.get(keys[row], time - 1)), None)
     if early is not None:
-        what = f"the S wave of station {keys[early][1]!r} is not after its P wave"
+        what = f"the S wave is not after the P wave of station {keys[early][1]!r}"
         advice = "correct the picks, or state the column of events with --column message=NAME"
         raise InvalidProblem(what, roles.table.at(early), advice)
 

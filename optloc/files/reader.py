@@ -249,8 +249,8 @@ def assemble(
         found, file.stations, epochs, [_stations_used(c, i) for c, i in zip(chunks, index, strict=True)]
     )
     # Convert excess paths to path sums now, since the station positions are known.
-    chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
-    chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
+    pairs = [(_add_baseline(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
+    chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
     chunks, index, target = split_phases(chunks, index, target, source)
     if azimuths:
         azimuths += declination_text(chunks)
@@ -414,8 +414,6 @@ def noise_of(
     """
     blocks = combined_noise(chunks, numbers)
     for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
-        if chunk.combination is not None:
-            continue
         if chunk.sigma is not None:
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
         elif chunk.arrival is not None:
@@ -427,7 +425,7 @@ def noise_of(
             blocks += [Block(number[m], _by_signal(chunk, chunk.signal, m)) for m in members]
         elif chunk.covariance is not None:
             blocks.append(_per_epoch_block(chunk, number, epoch, chunk.covariance))
-        else:
+        elif chunk.combination is None:
             advice = "give sigma, arrival_sigma, covariance or snr, or rows with a column sigma"
             raise InvalidProblem("the measurements have no noise", chunk.table.source, advice)
     return group(blocks)

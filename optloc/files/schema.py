@@ -229,8 +229,8 @@ class MeasurementsTable(DataTable):
     excess: bool = False
     """Whether the distance between the two stations is subtracted from a range_sum."""
     vp_vs: float | None = Field(default=None, gt=1.0)
-    """For arrivals (toa) with a column `phase`, P or S: the speed of P waves, which is the propagation speed, divided by
-    the speed of S waves. Rows of one epoch have one origin time."""
+    """For arrivals (toa) with a column `phase`, P or S: speed of P waves, the propagation speed, divided by the speed
+    of S waves. Rows of one epoch have one origin time."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None

@@ -399,8 +399,10 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
     """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
-    long = len(taken) == len(found)  # a table with one reading in each row has one column for each sort
-    if found[0].form.value in ("sp", "picks"):
+    # A table with one reading in each row has one column for each sort; picks may have a column for each wave.
+    picks = found[0].form.value in ("sp", "picks")
+    long = picks or len(taken) == len(found)
+    if picks:
         taken |= {column for role in ("p", "s", "phase", "time") if (column := roles.find(role))}
     if long and (station := roles.find("station")):
         taken.add(station)

@@ -66,7 +66,7 @@ _SPECIAL_FORMS = {
 
 
 def sort_named(name: str) -> Form:
-    """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "excess", "picks", "sp" or a kind."""
+    """Return a sort of reading by name: a special form, such as "times" (arrivals in the time column), or a kind."""
     return _SPECIAL_FORMS[name] if name in _SPECIAL_FORMS else Form(name, name, MODELS[name].summary)
 
 

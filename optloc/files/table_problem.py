@@ -126,7 +126,8 @@ class TableProblem:
         # JSON and TOML strings agree, except for escapes of characters beyond 16 bits; do not escape them.
         quoted = partial(json.dumps, ensure_ascii=False)
         lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
-        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", *(self.frame or (f'kind = "{self.places.frame}"',))]
+        frame = self.frame or (f'kind = "{self.places.frame}"',)
+        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", *frame]
         lines += ["", "[stations]", f"file = {quoted(names[0])}", f'unit = "{self.places.unit}"']
         for section, name in zip(self.sections, names[1:], strict=True):
             lines += ["", "[[measurements]]", f'kind = "{section.kind}"                         # {section.text}']

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -128,9 +129,7 @@ def _rows_of_event(picks: Sequence[int], station: Array, is_s: Array, ratio: flo
     reference = (paired or alone)[0]
     others = [i for i in alone if station[i] != station[reference]]
     share = 1.0 / ratio
-    rows += [
-        _Row("tdoa", int(station[i]), int(station[reference]), (i, reference), (share, -share)) for i in others
-    ]
+    rows += [_Row("tdoa", int(station[i]), int(station[reference]), (i, reference), (share, -share)) for i in others]
     return rows, [i for i in alone if i not in others]
 
 
@@ -218,6 +217,6 @@ def phases(
         for one in sets
     )
     stops = np.cumsum([0, *(len(one.a) for one in sets)])
-    numbers = [np.arange(start, stop) for start, stop in zip(stops[:-1], stops[1:], strict=True)]
+    numbers = [np.arange(start, stop) for start, stop in pairwise(stops.tolist())]
     blocks = phase_blocks(sets, numbers, event, deviation**2)
     return rows, dense(group(blocks), np.arange(stops[-1]))
