@@ -26,7 +26,7 @@ _CENTURY = 70
 # HYPO71 weights: 0 is full weight, 4 means that the pick is not used.
 _UNUSED = "4"
 # Characters of a line that a message shows.
-_SHOWN = 60
+_SHOWN = 40
 
 HYPO71 = re.compile(
     rb"(?:[ \t]*\r?\n)*(?=[A-Z0-9 ]{4})[A-Z0-9]{2,4} *[IE? ]P[ UDCN+?-][0-4 ].\d{6}[ \d]{4}[ \d]{2}[.\d][ \d]{2}"
@@ -58,9 +58,9 @@ def hypo71(text: str, source: str) -> Table:
                 continue
             weighted += weight in ("1", "2", "3")
             rows.append({"event": event, **row})
-    notes = [f"{unused} picks with weight 4 are left out"] if unused else []
+    notes = [f"picks with weight 4 are left out: {unused}"] if unused else []
     if weighted:
-        notes.append(f"{weighted} picks have weights 1 to 3, which are not used: all picks have the stated sigma")
+        notes.append(f"weights 1 to 3 are not used, so all picks have the stated sigma: {weighted} picks")
     return _table(rows, source, notes)
 
 
@@ -129,7 +129,7 @@ def nonlinloc(text: str, source: str) -> Table:
             continue
         sigma = error if error > 0.0 and cells[9] == "GAU" else None
         rows.append({"event": event, "station": cells[0], "phase": cells[4], "time": time, "sigma_s": sigma})
-    return _table(rows, source, [f"{unused} picks with prior weight 0 are left out"] if unused else [])
+    return _table(rows, source, [f"picks with prior weight 0 are left out: {unused}"] if unused else [])
 
 
 def quakeml(text: str, source: str) -> Table:
@@ -161,7 +161,7 @@ def quakeml(text: str, source: str) -> Table:
             deviation = pick.time_errors.uncertainty if pick.time_errors else None
             sigma = float(deviation) if deviation else None
             rows.append({"event": number, "station": station, "phase": phase, "time": str(pick.time), "sigma_s": sigma})
-    notes = [f"{unknown} picks that are rejected, or without phase or station, are left out"] if unknown else []
+    notes = [f"picks that are rejected, or without phase or station, are left out: {unknown}"] if unknown else []
     return _table(rows, source, notes)
 
 

@@ -99,7 +99,7 @@ def _picks(roles: Roles, hints: ColumnHints) -> tuple[list[Pick], tuple[str, ...
     picks = [(row, wave, time, 0) for row, time in _times(roles, hints, "time") if (wave := waves[row]) is not None]
     other = [str(word) for word, wave in zip(phase, waves, strict=True) if wave is None]
     names = ", ".join([*dict.fromkeys(other)][:_SHOWN])
-    note = f"{len(other)} picks of other phases than P and S are left out: {names}"
+    note = f"picks of other phases than P and S are left out: {len(other)} ({names})"
     return picks, (roles.column("time"),), (note,) if other else ()
 
 
