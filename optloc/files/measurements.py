@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from optloc.files.stations import numbers_of
 from optloc.files.table import Epochs, Table
 from optloc.files.words import distinct, numbered
 from optloc.models import Model
+from optloc.problem.phases import Combination
 from optloc.problem.signal import Signal
-
-if TYPE_CHECKING:
-    from optloc.files.phases import Combination
 
 ESTIMATE = "estimate"
 """Keyword instead of a standard deviation: estimate it from the data."""
@@ -198,6 +195,8 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
     if section.vp_vs is not None and (kind != "toa" or not c.table.has("phase")):
         advice = 'use the kind "toa" with a column phase, or remove the key'
         raise InvalidProblem("vp_vs is for arrivals with a phase", join(c.where, "key 'vp_vs'"), advice)
+    if section.vp_vs is not None and section.sigma == ESTIMATE:
+        raise InvalidProblem("P and S arrivals need a stated sigma", join(c.where, "key 'sigma'"), 'write "0.1 s"')
     if section.kind is None:
         return  # settings of a table of several kinds apply to the kinds that use them
     if section.excess and not _is_range_sum(model):

@@ -30,7 +30,7 @@ from optloc.files.measurements import (
     with_baseline,
     with_declination,
 )
-from optloc.files.phases import combined_noise, split_phases
+from optloc.files.phase_rows import combined_noise, split_phases
 from optloc.files.propagation import medium_in, speed_bias, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import (

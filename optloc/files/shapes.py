@@ -349,8 +349,7 @@ def _without_reference(found: Readings, table: Table) -> Readings:
     if not same.any():
         return found
     names = ", ".join(dict.fromkeys(np.asarray(found.a)[same].tolist()))
-    count = int(same.sum())
-    note = f"{count} zero reading{'s' if count > 1 else ''} of the reference station {names} to itself are left out"
+    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}"
     return replace(found.take(np.flatnonzero(~same)), notes=(*found.notes, note))
 
 

@@ -59,7 +59,26 @@ class PhaseRows:
         return np.asarray((values[..., self.arrival] * self.factor).sum(-1))
 
 
-class _Row(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """Rows of one kind that are combinations of arrivals.
+
+    Parameters
+    ----------
+    rows : PhaseRows
+        The rows.
+    event : int array (n,)
+        Number of the event of each arrival of the section.
+    variance : array (n,)
+        Variance of each arrival, square metres.
+    """
+
+    rows: PhaseRows
+    event: Array
+    variance: Array
+
+
+class _CombinedRow(NamedTuple):
     """One row: its kind, its stations, and the numbers and factors of its two arrivals."""
 
     kind: str
@@ -92,7 +111,7 @@ def phase_rows(station: Array, is_s: Array, event: Array, ratio: float) -> tuple
         raise InvalidProblem(f"the ratio vp / vs is {ratio:g}, not above 1", "vs", "give a vs that is less than vp")
     order = np.argsort(event, kind="stable")
     starts = np.flatnonzero(np.diff(event[order], prepend=event[order[:1]] - 1 if len(order) else 0))
-    rows: list[_Row] = []
+    rows: list[_CombinedRow] = []
     unused: list[int] = []
     for picks in np.split(order, starts[1:]) if len(order) else ():
         found, left = _rows_of_event(picks.tolist(), station, is_s, ratio)
@@ -106,7 +125,9 @@ def phase_rows(station: Array, is_s: Array, event: Array, ratio: float) -> tuple
     return tuple(sets), np.array(unused, dtype=np.int64)
 
 
-def _rows_of_event(picks: Sequence[int], station: Array, is_s: Array, ratio: float) -> tuple[list[_Row], list[int]]:
+def _rows_of_event(
+    picks: Sequence[int], station: Array, is_s: Array, ratio: float
+) -> tuple[list[_CombinedRow], list[int]]:
     """Return the rows of the arrivals `picks` of one event, and the arrivals that no row contains.
 
     `station`, `is_s` and `ratio` are as for `phase_rows`.
@@ -116,20 +137,22 @@ def _rows_of_event(picks: Sequence[int], station: Array, is_s: Array, ratio: flo
     for i in picks:
         if not is_s[i]:
             first_p.setdefault(int(station[i]), i)
-            rows.append(_Row("toa", int(station[i]), -1, (i, i), (1.0, 0.0)))
+            rows.append(_CombinedRow("toa", int(station[i]), -1, (i, i), (1.0, 0.0)))
     late = [i for i in picks if is_s[i]]
     if not first_p:
-        return [_Row("toa", int(station[i]), -1, (i, i), (1.0 / ratio, 0.0)) for i in late], []
+        return [_CombinedRow("toa", int(station[i]), -1, (i, i), (1.0 / ratio, 0.0)) for i in late], []
     paired = [i for i in late if int(station[i]) in first_p]
     share = 1.0 / (ratio - 1.0)
-    rows += [_Row("range", int(station[i]), -1, (i, first_p[int(station[i])]), (share, -share)) for i in paired]
+    rows += [_CombinedRow("range", int(station[i]), -1, (i, first_p[int(station[i])]), (share, -share)) for i in paired]
     alone = [i for i in late if int(station[i]) not in first_p]
     if not alone:
         return rows, []
     reference = (paired or alone)[0]
     others = [i for i in alone if station[i] != station[reference]]
     share = 1.0 / ratio
-    rows += [_Row("tdoa", int(station[i]), int(station[reference]), (i, reference), (share, -share)) for i in others]
+    rows += [
+        _CombinedRow("tdoa", int(station[i]), int(station[reference]), (i, reference), (share, -share)) for i in others
+    ]
     return rows, [i for i in alone if i not in others]
 
 

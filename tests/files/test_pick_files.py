@@ -51,11 +51,12 @@ def quakeml() -> str:
     for i, (name, wave, time) in enumerate(picks()):
         hint = "<phaseHint>P</phaseHint>" if wave == "P" else ""
         made.append(
-            f'<pick publicID="smi:local/pick/{i}"><time><value>{time.isoformat()}Z</value><uncertainty>0.05</uncertainty>'
-            f'</time><waveformID networkCode="IV" stationCode="{name}"/>{hint}</pick>'
+            f'<pick publicID="smi:local/pick/{i}"><time><value>{time.isoformat()}Z</value>'
+            f'<uncertainty>0.05</uncertainty></time><waveformID networkCode="IV" stationCode="{name}"/>{hint}</pick>'
         )
         arrivals.append(
-            f'<arrival publicID="smi:local/arrival/{i}"><pickID>smi:local/pick/{i}</pickID><phase>{wave}g</phase></arrival>'
+            f'<arrival publicID="smi:local/arrival/{i}"><pickID>smi:local/pick/{i}</pickID>'
+            f"<phase>{wave}g</phase></arrival>"
         )
     origin = (
         '<origin publicID="smi:local/origin/1"><time><value>2024-04-06T01:32:38Z</value></time><latitude><value>42'
@@ -63,7 +64,8 @@ def quakeml() -> str:
     )
     return (
         '<?xml version="1.0" encoding="utf-8"?>\n<q:quakeml xmlns:q="http://quakeml.org/xmlns/quakeml/1.2" '
-        'xmlns="http://quakeml.org/xmlns/bed/1.2"><eventParameters publicID="smi:local/1"><event publicID="smi:local/e/1">'
+        'xmlns="http://quakeml.org/xmlns/bed/1.2"><eventParameters publicID="smi:local/1">'
+        '<event publicID="smi:local/e/1">'
         f"<preferredOriginID>smi:local/origin/1</preferredOriginID>{''.join(made)}{origin}</event></eventParameters>"
         "</q:quakeml>\n"
     )
@@ -118,7 +120,7 @@ def test_picks_of_obspy_without_phase_are_left_out(tmp_path, monkeypatch):
 
     event = Record(preferred_origin=lambda: None, origins=[], picks=[pick("AQU", "P"), pick("FIAM", None)])
     module = ModuleType("obspy")
-    module.read_events = lambda data, format: [event]
+    module.read_events = lambda data, **_: [event]
     monkeypatch.setitem(sys.modules, "obspy", module)
     (tmp_path / "event.xml").write_text(quakeml())
     table = read_table(tmp_path / "event.xml")

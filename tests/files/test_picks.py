@@ -66,6 +66,7 @@ def test_nine_p_and_four_s_through_layers(vinti):
     assert any("vp / vs = 1.68" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_robust_finds_the_late_station(vinti):
     # NonLinLoc leaves REVF out: 43.794, 7.557, 10.7 km; own layered least squares without it 43.794, 7.555, 10.2 km
     fix = solved(vinti, "robust", vp=str(vinti.parent / "crust.csv"), sigma="0.1 s")

@@ -84,7 +84,7 @@ def test_without_a_station_with_both_one_s_arrival_is_unused():
 
 @pytest.mark.parametrize("ratio", [1.0, 0.5, np.inf, np.nan])
 def test_s_waves_are_slower(ratio):
-    with pytest.raises(InvalidProblem, match="the ratio vp / vs is .* not above 1"):
+    with pytest.raises(InvalidProblem, match=r"the ratio vp / vs is .* not above 1"):
         phase_rows(np.zeros(1, dtype=int), np.ones(1, dtype=bool), np.zeros(1), ratio)
 
 

@@ -52,3 +52,27 @@ def test_other_forms_hold_the_same_position():
 def test_a_p_value_is_short_and_absent_without_redundancy():
     assert as_p(np.nan) == "-"
     assert float(as_p(0.25)) == 0.25
+
+
+def test_alternatives_on_earth_have_latitude_longitude_and_height():
+    from optloc.show.columns import alternative_latlon, fix_detail
+    from optloc.show.fixes import alternative_sheet
+
+    site = optloc.Frame.enu(lat_deg=47.0, lon_deg=8.0)
+    places = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 0.0], [0.0, 900.0, 0.0]])
+    truth = np.array([300.0, 400.0, 200.0])
+    rows = optloc.measured("range", np.linalg.norm(places - truth, axis=1), a=[0, 1, 2], sigma=1.0)
+    fix = optloc.solve(optloc.assemble(places, rows, frame=site))
+    sheet = alternative_sheet(fix)
+    assert sheet is not None
+    other = alternative_latlon(fix, fix.alternatives.x[0])
+    assert other == pytest.approx(
+        np.stack([np.degrees(v) if i < 2 else v for i, v in enumerate(site.to_geodetic([300.0, 400.0, -200.0]))])
+        if fix.position[2] > 0
+        else np.stack([np.degrees(v) if i < 2 else v for i, v in enumerate(site.to_geodetic(truth))]),
+        abs=1e-6,
+    )
+    assert fix_detail(fix)["alternatives"][0]["latlon"] is not None
+    plain = optloc.solve(optloc.assemble(places, rows))
+    assert alternative_latlon(plain, plain.x) is None
+    assert "latlon" not in fix_detail(plain)["alternatives"][0]

@@ -4,7 +4,7 @@ import pytest
 
 import optloc
 from optloc import InvalidProblem
-from optloc.files.phases import wave_of
+from optloc.files.phase_rows import wave_of
 
 FILE = """
 format = 2
@@ -49,8 +49,12 @@ def test_an_s_pick_makes_three_arrivals_in_the_plane_enough_for_a_test(tmp_path)
 
 
 def test_a_pick_of_weight_zero_is_absent(tmp_path):
-    path = written(tmp_path, '{ a = "A", phase = "S", z = 2.45833 }', '{ a = "A", phase = "S", z = 9.0, weight = 0 }')
+    path = written(tmp_path, ", z =", ", weight = 1, z =")
+    path.write_text(path.read_text().replace('"S", weight = 1', '"S", weight = 0'))
     assert optloc.load(path).count == 3
+    path.write_text(path.read_text().replace('"S", weight = 0', '"S", weight = 0.5'))
+    with pytest.raises(InvalidProblem, match="P and S arrivals need standard deviations, and weights of 0 or 1"):
+        optloc.load(path)
 
 
 @pytest.mark.parametrize(
@@ -58,9 +62,8 @@ def test_a_pick_of_weight_zero_is_absent(tmp_path):
     [
         ('kind = "toa"', 'kind = "range"', "vp_vs is for arrivals with a phase"),
         ('phase = "S"', 'phase = "Lg"', "row 4, .*the phase 'Lg' is neither P nor S; write P or S, or remove the row"),
-        ('sigma = "0.05 s"', 'arrival_sigma = "0.05 s"', "P and S arrivals need standard deviations"),
+        ('sigma = "0.05 s"', 'sigma = "estimate"', "P and S arrivals need a stated sigma"),
         ("vp_vs = 1.75", "vp_vs = 0.5", "vp_vs"),
-        ("z = 2.45833", "z = 2.45833, weight = 0.5", "and weights of 0 or 1"),
     ],
 )
 def test_mistakes_are_one_sentence(old, new, words, tmp_path):

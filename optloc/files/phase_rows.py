@@ -7,7 +7,7 @@ differences with a joint noise (`optloc.problem.phases`). In shapes, m is the nu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,26 +18,7 @@ from optloc.files.measurements import RowChunk
 from optloc.files.schema import join
 from optloc.files.table import Table
 from optloc.problem.noise import Block
-from optloc.problem.phases import PhaseRows, phase_blocks, phase_rows
-
-
-@dataclass(frozen=True, slots=True)
-class Combination:
-    """Rows of one kind that are combinations of arrivals.
-
-    Parameters
-    ----------
-    rows : PhaseRows
-        The rows.
-    event : int array (n,)
-        Number of the event of each arrival of the section.
-    variance : array (n,)
-        Variance of each arrival, square metres.
-    """
-
-    rows: PhaseRows
-    event: Array
-    variance: Array
+from optloc.problem.phases import Combination, phase_blocks, phase_rows
 
 
 def wave_of(phase: str) -> str | None:
