@@ -1,17 +1,17 @@
 """P and S waves of one source: their arrivals as arrival times, ranges and range differences, with one origin time.
 
-An arrival is multiplied by the speed vp of P waves, metres. For a station at the range r it is ``r + e`` for P and
-``k r + e`` for S, with the ratio k = vp / vs and the unknown origin time e. Linear combinations of the arrivals of an
-event have the form of other rows:
+An arrival is multiplied by the speed vp of P waves, metres. The arrival at the range r is ``r + e`` for P and
+``k r + e`` for S. Here k = vp / vs is a ratio, and e is the unknown origin time. Linear combinations of the arrivals of
+an event have the form of other rows:
 
 - P alone: the arrival time ``r + e``.
 - S minus P of one station: ``(k - 1) r``, a range.
 - S minus S of two stations: ``k (r_a - r_b)``, a range difference.
 - S, if no station has P: divided by k, the arrival time ``r + e / k``.
 
-The combinations are as many as the arrivals and linearly independent. So with the covariance that the errors of the
-arrivals give them, every position has the same cost as with the arrivals themselves. The proof and the closed forms for
-these kinds then apply. If an event has P and S, but no station has both, one S arrival stays unused.
+The combinations are linearly independent, and their number is the number of arrivals. Their covariance follows from the
+errors of the arrivals. So every position has the same cost as with the arrivals. The proof and the closed forms for
+these kinds apply. If an event has P and S, but no station has both, one S arrival stays unused.
 
 Letters: n arrivals of all events, m rows.
 """
@@ -212,15 +212,11 @@ def phases(
     --------
     >>> import numpy as np, optloc
     >>> from optloc.problem.phases import phases
-    >>> places = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3], [9e3, 9e3]])
+    >>> places = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3], [9e3, 9e3]])  # Four stations.
     >>> r = np.linalg.norm(places - [4e3, 3e3], axis=1)
-    >>> rows, joint = phases(
-    ...     np.concatenate([r + 5e3, 1.75 * r[:2] + 5e3]),
-    ...     a=[0, 1, 2, 3, 0, 1],
-    ...     is_s=[False] * 4 + [True] * 2,
-    ...     ratio=1.75,
-    ...     sigma=100.0,
-    ... )
+    >>> z = np.append(r, 1.75 * r[:2]) + 5e3  # Four P, two S.
+    >>> is_s = np.arange(6) >= 4  # The last two.
+    >>> rows, joint = phases(z, a=[0, 1, 2, 3, 0, 1], is_s=is_s, ratio=1.75, sigma=100.0)  # Two blocks.
     >>> fix = optloc.solve(optloc.assemble(places, *rows, covariance=joint))
     >>> fix.position.round(3).tolist()
     [4000.0, 3000.0]
