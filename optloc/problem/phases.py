@@ -211,7 +211,7 @@ def phases(
     Examples
     --------
     >>> import numpy as np, optloc
-    >>> from optloc.problem.phases import phases
+    >>> from optloc.problem.phases import phases  # Rows and noise.
     >>> places = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3], [9e3, 9e3]])  # Four stations.
     >>> r = np.linalg.norm(places - [4e3, 3e3], axis=1)
     >>> z = np.append(r, 1.75 * r[:2]) + 5e3  # Four P, two S.
