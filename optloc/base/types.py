@@ -261,6 +261,11 @@ class Band:
     along : bool
         Whether the constraint applies at every epoch of a run (for a height, minus its known `rise`), or at the
         reference time only.
+    other : int, optional
+        Number of a second target, for a quantity of two targets.
+    table : object, optional
+        Immutable data of the quantity that are no coefficients, for instance a grid of heights. It needs a property
+        `digest` that differs for different data.
     """
 
     kind: str
@@ -270,6 +275,8 @@ class Band:
     name: str
     target: int = 0
     along: bool = False
+    other: int | None = None
+    table: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,11 +291,37 @@ class Polygon:
         Name in reports.
     target : int
         Number of the target.
+    outside : bool
+        Whether the target is outside the polygon instead.
     """
 
     vertices: Array
     name: str = "polygon"
     target: int = 0
+    outside: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AnyOf:
+    """A constraint: a union of regions, of which at least one contains the target.
+
+    Parameters
+    ----------
+    members : tuple of tuples of Band
+        The regions. Each is a conjunction: a target is in it if it satisfies all of its bands.
+    name : str
+        Name in reports.
+    target : int
+        Number of the target.
+    """
+
+    members: tuple[tuple[Band, ...], ...]
+    name: str = "any of"
+    target: int = 0
+
+
+Constraint = Band | Polygon | AnyOf
+"""A condition that an answer must meet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,6 +341,34 @@ class Prior:
     name: str
     mean: Array
     covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Fence:
+    """A half-plane that contains the target, with an uncertain boundary: ``n . x <= b + N(0, s^2)``.
+
+    It is no constraint: it adds ``-2 log Phi((b - n . x) / s)`` to the cost, where Phi is the normal distribution
+    function.
+
+    Parameters
+    ----------
+    normal : array (..., d)
+        Unit normal n, directed out of the half-plane.
+    offset : array (...)
+        Stated place b of the boundary along the normal, metres.
+    sigma : array (...)
+        Standard deviation s of this place, metres.
+    name : str
+        Name in reports.
+    target : int
+        Number of the target. Of a moving target, the position at the reference time counts.
+    """
+
+    normal: Array
+    offset: Array
+    sigma: Array
+    name: str = "fence"
+    target: int = 0
 
 
 # Status: is there an answer? Certificate: is it the best one?

@@ -32,8 +32,8 @@ from optloc.cli.output import (
     write_results,
     write_text,
 )
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded
-from optloc.files.schema import ConstraintTable
 from optloc.files.table_import import ColumnHints
 from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of

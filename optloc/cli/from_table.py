@@ -17,8 +17,8 @@ from optloc.cli.options import Budget, Force, Json, Quiet, Verbose
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from optloc.files.constraint_table import ConstraintTable
     from optloc.files.reader import Loaded
-    from optloc.files.schema import ConstraintTable
     from optloc.files.table_import import ColumnHints
     from optloc.files.table_problem import Converted, TableProblem
 

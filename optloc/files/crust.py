@@ -18,7 +18,7 @@ from optloc.base.units import UNITS
 from optloc.files.columns import stem, unit_of
 from optloc.files.csv_formats import read_table
 from optloc.files.roles import ColumnPlaces
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.table import Table
 from optloc.files.table_import import ColumnHints
 

@@ -18,7 +18,8 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array, Stations
 from optloc.base.units import LARGEST, Conversion
 from optloc.files.declination import declination_of, declinations
-from optloc.files.schema import MeasurementsTable, Units, join, kind_model
+from optloc.files.schema import MeasurementsTable, kind_model
+from optloc.files.settings import Units, join
 from optloc.files.stations import numbers_of
 from optloc.files.table import Epochs, Table
 from optloc.files.words import distinct, numbered

@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.files.measurements import RowChunk
-from optloc.files.schema import join
+from optloc.files.settings import join
 from optloc.files.table import Table
 from optloc.problem.noise import Block
 from optloc.problem.phases import Combination, phase_blocks, phase_rows

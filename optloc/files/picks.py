@@ -18,7 +18,7 @@ from optloc.base.units import UNITS
 from optloc.files.cell_text import Decimals, date_seconds, is_dated, numbers
 from optloc.files.phase_rows import wave_of
 from optloc.files.roles import Roles
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.table_import import ColumnHints, Readings, in_unit, sort_named, unit_for
 from optloc.files.words import objects
 

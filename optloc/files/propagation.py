@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.base.units import SPEED_OF_LIGHT, sound_in_air, sound_in_water
-from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable, Units, join
+from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable
+from optloc.files.settings import Units, join
 from optloc.models.medium import Atmosphere, Layers, Medium
 from optloc.problem.bias import SPEED, scale_of
 

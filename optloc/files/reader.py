@@ -20,6 +20,15 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, check_budget
 from optloc.base.types import Array, Bias, Rows, Stations
+from optloc.files.constraint_reader import (
+    Demand,
+    StatedConstraints,
+    constraints_of,
+    demands_of,
+    limits_of,
+    stated_arguments,
+)
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.measurements import (
     ESTIMATE,
     RowChunk,
@@ -33,21 +42,13 @@ from optloc.files.measurements import (
 from optloc.files.phase_rows import combined_noise, split_phases
 from optloc.files.propagation import medium_in, speed_bias, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
-from optloc.files.schema import (
-    ConstraintTable,
-    ProblemFile,
-    Units,
-    join,
-    name_of,
-    read_document,
-    validate,
-)
+from optloc.files.schema import ProblemFile, name_of, read_document, validate
+from optloc.files.settings import Units, join
 from optloc.files.stations import over_epochs, station_table, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
 from optloc.files.unknowns import (
     FREE,
     bias_of,
-    constraints_of,
     known_of,
     motions_of,
     needs_clock,
@@ -192,11 +193,11 @@ def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | Non
     """Return the problem of a file together with its tables; the arguments are as in `read`."""
     file, source = read_document(path), name_of(path)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
-    known = places_of(file, path.parent, source)
+    known, limits = places_of(file, path.parent, source), limits_of(file, path.parent, source)
     stations = table_of(file.stations, path.parent, join(source, "[stations]"))
     places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
     tables = [table_of(m, path.parent, place) for m, place in zip(file.measurements, places, strict=True)]
-    return assemble(file, stations, tables, source, values=values, known=known, more=more)
+    return assemble(file, stations, tables, source, values=values, known=known, limits=limits, more=more)
 
 
 def assemble(
@@ -207,6 +208,7 @@ def assemble(
     *,
     values: bool,
     known: Mapping[str | None, Table] | None = None,
+    limits: Mapping[str, Demand] | None = None,
     more: Mapping[str, ConstraintTable] | None = None,
 ) -> Draft:
     """Return the problem of settings and tables.
@@ -225,6 +227,8 @@ def assemble(
         Whether measured values are required.
     known : mapping of str to Table, optional
         Positions of known targets by name; None is the key of the single target.
+    limits : mapping of str to constraints, optional
+        The constraints by their place for messages, see `limits_of`; by default those of `file`.
     more : mapping of str to ConstraintTable, optional
         As in `read`.
     """
@@ -252,24 +256,22 @@ def assemble(
     pairs = [(_add_baseline(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
     chunks, index, target = split_phases(chunks, index, target, source)
-    if azimuths:
-        azimuths += declination_text(chunks)
+    azimuths += declination_text(chunks) if azimuths else ""
     rows, numbers = _rows(chunks, index, target)
-    noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
     biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
     units = {bias.name: unit for bias, unit in biases if unit[0]}  # no entry for rows in several units
     all_biases = tuple(bias for bias, _ in biases)
     all_biases += speed_bias(file, written, all_biases, source)
-    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, more or {})
-    # The estimation of noise needs fixes, and so the whole problem: do it last.
+    demands = {**(limits_of(file, None, source) if limits is None else limits), **demands_of(more or {})}
+    noise = _noise(file, chunks, numbers, index, target, source)
+    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, demands)
+    # The estimation of noise needs fixes, so do it last.
     problem, levels = with_noise(file, problem, source)
-    title = file.title or source
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
-    loaded = Loaded(problem, source, title, *named, levels, units, azimuths)
-    return Draft(
-        loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _has_moving_target(problem)
-    )
+    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths)
+    moving = found.moving or _has_moving_target(problem)
+    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 
 
 def _problem(
@@ -282,11 +284,11 @@ def _problem(
     frame: Frame,
     source: str,
     known: Mapping[str | None, Table],
-    more: Mapping[str, ConstraintTable],
+    demands: Mapping[str, Demand],
 ) -> Problem:
     """Return the checked problem with the motions, priors, constraints and medium of the file.
 
-    `known` has the positions of known targets by name. `more` has further constraints, by their place for messages.
+    `known` has the positions of known targets by name, and `demands` the constraints by their place for messages.
     """
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
@@ -294,8 +296,6 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
-    demands |= more
     constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     check_budget("unknowns", made.layout.n_shared, source)
@@ -398,7 +398,7 @@ def _noise(
     if file.covariance is None:
         return noise_of(chunks, numbers, index, target)
     place = join(source, "key 'covariance'")
-    if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal)):
+    if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal, c.combination)):
         raise InvalidProblem("the noise is given more than once", place, "remove the noise of the single measurements")
     matrix = square(file.covariance, place)
     slope = np.concatenate([chunk.slope for chunk in chunks])
@@ -506,7 +506,6 @@ def _check(problem: Problem, source: str, medium: Medium | None = None) -> Probl
     """Return the problem in its medium after all checks; an error names the file."""
     try:
         return checked(problem if medium is None else problem.in_medium(medium))
-    # Add the name of the file to an error of the problem.
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
 
@@ -532,7 +531,7 @@ def from_table(
     window: str | None = None,
     propagation_speed: float | None = None,
     station_options: Mapping[str, object] | None = None,
-    constraints: Sequence[Mapping[str, object]] = (),
+    constraints: StatedConstraints = (),
     values: bool = True,
     **options: object,
 ) -> Problem:
@@ -563,8 +562,9 @@ def from_table(
         Metres per second; by default light in vacuum.
     station_options : mapping, optional
         Further keys of the table ``[stations]`` of a problem file, for instance ``{"unit": "km"}``.
-    constraints : sequence of mapping
-        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``.
+    constraints : sequence of mapping or of constraints
+        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``; or
+        constraints of `optloc.constraints`.
     values : bool
         Whether measured values are required; False to simulate them.
     **options
@@ -594,7 +594,7 @@ def from_table(
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},
-        "constraints": [dict(constraint) for constraint in constraints],
     }
-    file = validate(settings, "arguments")
-    return assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
+    file, limits = validate(settings, "arguments"), stated_arguments(constraints)
+    rows = [of_frame(table, "table", names)]
+    return assemble(file, places, rows, "arguments", values=values, limits=limits).loaded.problem

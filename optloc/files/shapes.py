@@ -22,7 +22,7 @@ from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.picks import differences, read_picks
 from optloc.files.roles import ColumnPlaces, Roles, placed
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.table import Table
 from optloc.files.table_import import (
     CARTESIAN,

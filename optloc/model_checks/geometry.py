@@ -123,7 +123,7 @@ def _shape(problem: Problem) -> _Shape | None:
             return None
         present = weight[start : start + rows.count] > 0.0
         numbers |= {int(i) for index in (rows.a, rows.b)[: model.stations] for i in index[present]}
-    if len(numbers) < 2 or any(prior.name.startswith("position") for prior in problem.priors):
+    if len(numbers) < 2 or problem.fences or any(prior.name.startswith("position") for prior in problem.priors):
         return None
     places = problem.stations.position[..., sorted(numbers), :].reshape(-1, problem.dimension)
     centre, _ = centre_and_spread(places)
@@ -187,6 +187,8 @@ def _equality_excludes_image(problem: Problem, shape: _Shape) -> bool:
             if abs(float(c @ normal[: len(c)])) > _ACROSS * float(np.linalg.norm(c)) and off > 0.0:
                 return True
         if band.kind == "height" and abs(float(problem.frame.enu_axes(shape.centre)[2] @ normal)) > _ACROSS:
+            return True
+        if band.kind == "terrain" and abs(float(normal[2])) > _ACROSS:
             return True
     return False
 

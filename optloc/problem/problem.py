@@ -15,7 +15,20 @@ import numpy as np
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import (
+    AnyOf,
+    Array,
+    Band,
+    Bias,
+    CompassRows,
+    Constraint,
+    Fence,
+    Motion,
+    Polygon,
+    Prior,
+    Rows,
+    Stations,
+)
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium
@@ -46,10 +59,12 @@ class Problem:
         Gaussian prior knowledge of named unknowns.
     frame : Frame
         Coordinate frame.
-    constraints : tuple of Band or Polygon
-        Conditions that the answer must meet.
+    constraints : tuple of Band, Polygon or AnyOf
+        Conditions that the answer must meet. A `Fence` among them becomes a member of `fences`.
     medium : Layers or Atmosphere, optional
         Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
+    fences : tuple of Fence
+        Uncertain half-planes, which are terms of the cost.
     """
 
     stations: Stations
@@ -60,8 +75,18 @@ class Problem:
     biases: tuple[Bias, ...] = ()
     priors: tuple[Prior, ...] = ()
     frame: Frame = CARTESIAN
-    constraints: tuple[Band | Polygon, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
     medium: Medium | None = None
+    fences: tuple[Fence, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Move fences from the constraints to `fences`: users state both in one list."""
+        given: tuple[Any, ...] = self.constraints
+        stated = tuple(c for c in given if isinstance(c, Fence))
+        if stated:
+            kept = tuple(c for c in given if not isinstance(c, Fence))
+            object.__setattr__(self, "constraints", kept)
+            object.__setattr__(self, "fences", (*self.fences, *stated))
 
     @property
     def dimension(self) -> int:
@@ -167,10 +192,11 @@ class Problem:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons are not part of the key: cached programs depend on the bands of their edges, which their keys
         # contain.
-        bands = [c for c in self.constraints if isinstance(c, Band)]
-        constraints = tuple((c.kind, c.target, *_band_key(c, self.motions[c.target])) for c in bands)
-        medium = () if self.medium is None else (self.medium,)
-        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
+        constraints = tuple(_constraint_key(c, self.motions) for c in self.constraints if not isinstance(c, Polygon))
+        medium: tuple[Any, ...] = () if self.medium is None else (self.medium,)
+        fences = (("fences", *(fence.target for fence in self.fences)),) if self.fences else ()
+        found = (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
+        return (*found, *medium, *fences)
 
     def in_medium(self, medium: Medium) -> Problem:
         """Return the problem with its rows measured along the rays of a medium. All positions stay.
@@ -290,9 +316,21 @@ def _motion_key(motion: Motion) -> tuple[Any, ...]:
     return () if motion.over == "space" and motion.rise is None else (motion.over, motion.rise is None)
 
 
-def _band_key(band: Band, motion: Motion) -> tuple[str, ...]:
-    """Return the part of a key that marks a band along a course that is unknown; () otherwise."""
-    return ("along",) if band.along and motion.order and motion.span == "run" else ()
+def _constraint_key(constraint: Band | AnyOf, motions: tuple[Motion, ...]) -> tuple[Any, ...]:
+    """Return the part of a key that describes a constraint without its numbers."""
+    if isinstance(constraint, AnyOf):
+        members = tuple(tuple(_constraint_key(band, motions) for band in member) for member in constraint.members)
+        return ("any of", constraint.target, members)
+    return (constraint.kind, constraint.target, *_band_key(constraint, motions))
+
+
+def _band_key(band: Band, motions: tuple[Motion, ...]) -> tuple[Any, ...]:
+    """Return the parts of a key for a band along an unknown course, of two targets, or with a table; () otherwise."""
+    motion = motions[band.target]
+    along = ("along",) if band.along and motion.order and motion.span == "run" else ()
+    other = () if band.other is None else ("other", band.other)
+    # programs contain the numbers of a table
+    return (*along, *other, *(() if band.table is None else ("table", band.table.digest)))
 
 
 def _bias_key(bias: Bias) -> tuple[Any, ...]:
@@ -323,8 +361,16 @@ _NUMBERS: dict[type, dict[str, int]] = {
     Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},
     Band: {"lower": 0, "upper": 0, "coefficients": 1},
+    Fence: {"normal": 1, "offset": 0, "sigma": 0},
     Polygon: {},
 }
+
+
+def _parts(constraint: Constraint) -> tuple[Band | Polygon, ...]:
+    """Return the parts of a constraint that have numeric arrays: itself, or the bands of a union."""
+    if isinstance(constraint, AnyOf):
+        return tuple(band for member in constraint.members for band in member)
+    return (constraint,)
 
 
 def _numbers(part: Any) -> list[tuple[str, Array, int]]:
@@ -336,7 +382,9 @@ def _numbers(part: Any) -> list[tuple[str, Array, int]]:
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     """Return each numeric array of a problem, with its rank without batch axes."""
     blocks = problem.noise.blocks
-    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *problem.constraints)
+    limits = tuple(part for constraint in problem.constraints for part in _parts(constraint))
+    stated = (*problem.motions, *problem.priors, *limits, *problem.fences)
+    parts = (problem.stations, *problem.rows, *blocks, *stated)
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
@@ -347,6 +395,8 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
     """
 
     def changed(part: Any) -> Any:
+        if isinstance(part, AnyOf):
+            return replace(part, members=tuple(each(member) for member in part.members))
         arrays = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
         numbers = {name: new for name, old, new in arrays if new is not old}
         return replace(part, **numbers) if numbers else part
@@ -362,6 +412,7 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
         motions=each(problem.motions),
         priors=each(problem.priors),
         constraints=each(problem.constraints),
+        fences=each(problem.fences),
     )
 
 

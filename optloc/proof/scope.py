@@ -56,6 +56,8 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield from _reasons_against_scale(problem)
     yield from _reasons_against_stations(problem)
     yield from _reasons_against_constraints(problem)
+    if problem.fences:
+        yield f"{problem.fences[0].name!r} is an uncertain fence, whose cost the proof does not bound"
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
     # `optloc.proof.position_costs` writes priors on known names as rows. Other priors would silently be left out of
