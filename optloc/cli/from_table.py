@@ -293,9 +293,10 @@ def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptio
 
     `given` has the values of the table options. Raise InvalidProblem for a problem file with options of tables.
     """
+    from optloc.files.csv_formats import is_log
     from optloc.files.table_import import ColumnHints
 
-    if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
+    if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()) or is_log(file):
         return ColumnHints(**given)
     wave: WaveOptions | None = given.get("wave")
     stated = [name for name, value in given.items() if value and name != "wave"]

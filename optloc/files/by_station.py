@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, no_station
 from optloc.base.types import Array
-from optloc.files.columns import stem, unit_of
+from optloc.files.columns import roles, stem, unit_of
 from optloc.files.roles import WORDS
 from optloc.models import MODELS
 
@@ -190,7 +190,9 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
             if {str(label) for label in frame.index} <= {*names}:
                 advice = "the rows are the stations: give the transposed frame, .T"
             raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
-    epochs = next((stems[each] for each in ("epoch", "message", "msg", "pulse") if each in stems), None)
+    # The words of tables; a column of times has the values of `toa`, and labels the rows of other arguments.
+    epoch_words = ("epoch", *roles()["message"].names, *(() if word == "toa" else ("time", "timestamp")))
+    epochs = next((stems[each] for each in epoch_words if each in stems), None)
     ends = [str(name) for name in frame[chosen["a"]]]
     if word == "tdoa" and chosen["b"] is not None:
         ends = list(zip(ends, (str(name) for name in frame[chosen["b"]]), strict=True))  # type: ignore[arg-type]

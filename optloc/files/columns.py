@@ -30,6 +30,7 @@ _PREFIX = re.compile(r"^field\.", re.IGNORECASE)
 
 _CLOCK = tuple(UNITS["time"])
 _ANGLE = tuple(UNITS["angle"])
+_LENGTHS = tuple(UNITS["length"])
 # A coordinate is never a time, although a measured length may be given as a time.
 _LENGTH = tuple(unit for unit in UNITS["length"] if unit not in UNITS["time"])
 # Names of the two stations of a pair, such as anchor1 and anchor2.
@@ -88,11 +89,16 @@ _FIXED = {
         "time of the row; the arrival if the table has no other reading",
         "rxtime time timestamp utc datetime date t tgps gpstime tow", _CLOCK, "epoch",
     ),
+    "transmitter": _role("transmitter of a path by way of the target", "tx txid illuminator"),
     "target": _role("target of the row", "target tag mobile transmitter emitter icao hex mac device track"),
     "phase": _role("phase of a pick, P or S", "phase phasehint phasetype"),
     "p": _role("arrival of the P wave", "p tp ptime ppick parrival", _CLOCK),
     "s": _role("arrival of the S wave", "s ts stime spick sarrival", _CLOCK),
     "sp": _role("time from P to S", "sp sminusp spdifference stmp tstp", _CLOCK),
+    "excess": _role(
+        "path by way of the target minus the direct path",
+        "excess excesspath pathexcess excessdelay excessrange bistaticexcess bistaticdelay", _LENGTHS,
+    ),
     "heading": _role(
         "heading of the vehicle, added to its bearings",
         "heading hdg trueheading headingtrue magneticheading headingmagnetic magheading headingmag", _ANGLE,
@@ -117,6 +123,8 @@ _SHORT = {
 # Without a unit these names are heights in a table of stations; with a unit of angle they are elevations.
 _ANGLES_BY_UNIT = {"elevation": "elevation elev altitude alt"}
 _SIGMA = "sigma std stddev stdev sd uncertainty"
+# Only with a unit: without a unit these are qualities, such as the confidence of a KrakenSDR.
+_SIGMA_BY_UNIT = "confidence precision"
 # Other words for roles in --column.
 _OTHER = {"pseudorange": "toa", "arrivals": "toa"}
 PLACE = ("name", "x", "y", "z", "lat", "lon", "height", "depth")
@@ -136,7 +144,7 @@ def _roles(models: tuple[tuple[str, Model], ...]) -> Mapping[str, Role]:
     """
     kinds = {kind: _of_kind(kind, model) for kind, model in models if model.stations}
     every = dict.fromkeys(unit for units in UNITS.values() for unit in units)
-    return _FIXED | {"sigma": _role("standard deviation of the row", _SIGMA, every)} | kinds
+    return _FIXED | {"sigma": _role("standard deviation of the row", _SIGMA, every, _SIGMA_BY_UNIT)} | kinds
 
 
 def _of_kind(kind: str, model: Model) -> Role:
@@ -205,7 +213,8 @@ def check_unit(role: str, column: str) -> None:
 def sigma_kind(column: str) -> str | None:
     """Return the kind of a column of standard deviations, such as "range" for "range_std_m"; None for other columns."""
     words = tokens(without_unit(column))
-    rest = [word for word in words if word not in _SIGMA.split()]
+    known = _SIGMA if any_unit(column) is None else f"{_SIGMA} {_SIGMA_BY_UNIT}"
+    rest = [word for word in words if word not in known.split()]
     if len(rest) == len(words) or not rest:
         return None
     role = _by_name(tuple(MODELS.items())).get(("".join(rest), None))

@@ -23,19 +23,21 @@ from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cell_text import Decimals
 from optloc.files.columns import PLACE, role_named, role_of
+from optloc.files.crust import crust_of
 from optloc.files.csv_formats import read_table
 from optloc.files.declination import declination_of
 from optloc.files.headings import stations_turned
 from optloc.files.measurements import ESTIMATE
+from optloc.files.picks import phase_sigmas, waves_of
 from optloc.files.pseudoranges import is_gnss
 from optloc.files.reading_report import check_receivers, reading_lines, unused_columns, uses_of
 from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
-from optloc.files.settings import Units
 from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
 from optloc.files.table_import import (
     CONVENTIONS,
     ColumnHints,
+    Form,
     Named,
     Readings,
     as_angles,
@@ -51,8 +53,9 @@ from optloc.files.table_wave import with_wave
 from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
+from optloc.problem.problem import Problem
 
-INPUTS = ("arrivals", "sp", "pseudoranges", "stations")
+INPUTS = ("arrivals", "picks", "sp", "excess", "pseudoranges", "stations")
 
 # File endings of orbits. With --times, each file is read as orbits.
 _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
@@ -112,6 +115,35 @@ def convert(
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
 
 
+def load_table(source: str | Path, **options: Any) -> Problem:
+    """Return the problem of a file of readings, as ``optloc fix`` reads it.
+
+    The format is recognised by the content: a table, HYPO71 or NonLinLoc picks, QuakeML, opensoundscape events, RINEX
+    and the others that `convert` reads.
+
+    Parameters
+    ----------
+    source : str or Path
+        File of readings.
+    **options
+        Fields of `ColumnHints`, such as ``stations="net.csv"``, ``sigma="0.1 s"``, ``vp="6 km/s"`` and
+        ``vs="3.5 km/s"``.
+
+    Raises
+    ------
+    InvalidProblem
+        The message names the file, the row and the column.
+    """
+    paths = {name: Path(options[name]) for name in ("stations", "navigation", "times") if options.get(name) is not None}
+    known = [*ColumnHints.__dataclass_fields__]
+    unknown = next((name for name in options if name not in known), None)
+    if unknown is not None:
+        raise InvalidProblem(f"there is no option {unknown!r}", unknown, nearest(unknown, known))
+    hints = ColumnHints(**(options | paths))
+    _check_hints(hints)
+    return interpret_table(Path(source), hints).read().problem
+
+
 def _check_hints(hints: ColumnHints) -> None:
     """Raise InvalidProblem for unknown roles, frames and conventions."""
     for role in hints.columns:
@@ -126,11 +158,11 @@ def _check_hints(hints: ColumnHints) -> None:
 
 
 def _sort(word: str) -> str:
-    """Return the sort of readings for a word of --as: "arrivals", "sp", or a measurement kind.
+    """Return the sort of readings for a word of --as: "arrivals", "picks", "sp", "excess", or a measurement kind.
 
     Raise InvalidProblem for an unknown word, or a kind without stations.
     """
-    if word in ("arrivals", "sp"):
+    if word in ("arrivals", "picks", "sp", "excess"):
         return word
     try:
         kind = kind_named(word, "--as")
@@ -192,6 +224,7 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
             raise InvalidProblem("the station positions are unknown", "--stations", advice)
         stations, receivers = read_inline(roles, hints)
     forms = [sort_named(name) for name in sorts]
+    roles = _with_transmitters(roles, forms, stations)
     return _plan(
         roles,
         hints,
@@ -232,6 +265,20 @@ def _is_long(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> bool:
         return False
     # If receivers have columns of readings, a time column is the time of these readings, not a reading.
     return bool({*sorts_of(roles, hints)} - {"times"})
+
+
+def _with_transmitters(roles: Roles, forms: Sequence[Form], stations: ColumnPlaces) -> Roles:
+    """Return roles in which the column of transmitters is the second station of sums of ranges.
+
+    A column such as "transmitter" names targets in other tables. Here it names stations, if all its cells are stations.
+    """
+    if not all(form.kind == "range_sum" for form in forms) or roles.find("reference") is not None:
+        return roles
+    found = next((role for role in ("transmitter", "target") if roles.find(role) is not None), None)
+    if found is None or not holds_names(roles.table, roles.column(found), stations.names):
+        return roles
+    kept = {role: column for role, column in roles.by_role.items() if role != found}
+    return replace(roles, by_role={**kept, "reference": roles.column(found)})
 
 
 def _unknown(roles: Roles, hints: ColumnHints) -> InvalidProblem:
@@ -277,29 +324,24 @@ def _plan(
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
     notes += [note for note in (heading_note, stations.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
-    lines: tuple[str, ...] = ()
-    if any(one.form.value == "sp" for one in found):
-        speed = _sp_speed(hints)
-        lines = (f"propagation_speed = {speed!r}",)
-        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
-    after: tuple[str, ...] = ()
+    lines, after, frame, sections = _with_waves(sections, found, hints, stations, notes)
     # With a column "epoch", the window was already used to make its labels.
     if hints.window is not None and "epoch" not in epochs:
-        after = ("", "[epochs]", f"window = {json.dumps(hints.window)}")
+        after += ("", "[epochs]", f"window = {json.dumps(hints.window)}")
     height, note = _height(found, stations)
     notes += [*_few(sections, hints), *([note] if note else [])]
     read = [
         *reading_lines(roles, hints, stations, found, epochs, uses),
         *([("not used", ", ".join(rest))] if rest else []),
     ]
-    return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses)
+    return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses, frame)
 
 
 def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str]:
     """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
 
     Azimuths alone do not determine the height, so the mean height of the stations is assumed. S minus P times are of
-    earthquakes, which are below the highest station.
+    earthquakes, which are below the highest station, and so are picks of P and S waves.
     """
     if stations.frame != "geodetic":
         return "", ""
@@ -310,7 +352,7 @@ def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str
             f"bearings do not determine the height: {mean:g} {unit} is assumed, the mean of the stations, or --height"
         )
         return f'exactly = "{mean!r} {unit}"', remark
-    if any(one.form.value == "sp" for one in found):
+    if any(one.form.value in ("sp", "picks") for one in found):
         top = float(heights.max())
         return f'max = "{top!r} {unit}"', f"the earthquake is assumed below the highest station, {top:g} {unit}"
     return "", ""
@@ -321,7 +363,7 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
 
     The option `--sigma` has one value for all sorts, or a value for each kind, such as "tdoa=20 ns,azimuth=1 deg".
     """
-    if hints.sigma is None:
+    if hints.sigma is None or phase_sigmas(hints) is not None:
         for one in found:
             if one.sigma is None:
                 raise no_sigma("20 ns", one.form.kind if len(found) > 1 else "rows")
@@ -341,15 +383,38 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     return [given.get(one.form.kind) for one in found]
 
 
-def _sp_speed(hints: ColumnHints) -> float:
-    """Return the speed vp vs / (vp - vs), m/s, that converts S minus P to a range."""
-    if hints.vp is None or hints.vs is None:
-        advice = "state both, such as --vp '6 km/s' --vs '3.5 km/s'"
-        raise InvalidProblem("the speeds of the P and S waves are unknown", "--vp", advice)
-    vp, vs = (Units("speed").plain(given, None, where) for given, where in ((hints.vp, "--vp"), (hints.vs, "--vs")))
-    if not 0.0 < vs < vp:
-        raise InvalidProblem(f"P waves of {vp:g} m/s are not faster than S waves of {vs:g} m/s", "--vs", "correct it")
-    return vp * vs / (vp - vs)
+def _with_waves(
+    sections: tuple[Section, ...],
+    found: Sequence[Readings],
+    hints: ColumnHints,
+    stations: ColumnPlaces,
+    notes: list[str],
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], tuple[Section, ...]]:
+    """Return lines of the file for P and S waves, and the sections with their phases.
+
+    The lines are before the tables, after them, and in the frame.
+
+    A note on the speeds is added to `notes`.
+    """
+    if any(one.form.value == "sp" for one in found):
+        crust = crust_of(hints, with_s=True)
+        if crust.speed is None or crust.vp_vs is None:
+            raise InvalidProblem("S minus P alone needs two speeds", "--vp", "leave --as sp out to use layers")
+        speed = crust.speed / (crust.vp_vs - 1.0)
+        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
+        return (f"propagation_speed = {speed!r}",), (), (), sections
+    if found[0].form.value != "picks":
+        return (), (), (), sections
+    waves = waves_of(found[0])
+    crust = crust_of(hints, with_s=waves is not None)
+    notes.append(crust.note)
+    if waves is not None:
+        section = sections[0]
+        lines = (*section.lines, f"vp_vs = {crust.vp_vs!r}")
+        sections = (replace(section, columns={**section.columns, "phase": waves}, lines=lines),)
+    heights = stations.columns.get("height", stations.columns.get("z"))
+    highest = 0.0 if heights is None else float(np.max(heights)) * UNITS["length"][stations.unit]
+    return crust.lines, crust.medium(highest), crust.frame(stations), sections
 
 
 def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) -> Section:
@@ -366,6 +431,7 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
+    lines += ["excess = true"] if found.form.value == "excess" else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
         # As in `optloc.locate`, differences share the errors of their stations, each with half of the variance.

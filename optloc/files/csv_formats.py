@@ -1,4 +1,4 @@
-"""Files of other programs as tables: CSV, Parquet, nested records such as JSON, and KrakenSDR logs."""
+"""Files of other programs as tables: CSV, Parquet, nested records such as JSON, and logs such as of KrakenSDR."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import Any
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import check_budget, decoded, json_of, read_bytes
+from optloc.files import detections, pick_files
 from optloc.files.columns import any_unit, stem
 from optloc.files.table import Table, csv, of_rows, parquet
 
@@ -210,13 +211,11 @@ def read_table(path: Path) -> Table:
         return _parquet(path)
     if suffix in _JSON:
         return _json(path)
+    if (reader := _log_reader(path)) is not None:
+        return reader(decoded(read_bytes(path, lines=True), path.name), path.name)
     if suffix not in _TEXT and path.is_file():
         known = "use .csv, .tsv, .txt, .json or .parquet, and .geojson for stations"
         raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    data = read_bytes(path, lines=True)
-    for begins, reader in _LOGS:
-        if begins.match(data):
-            return reader(decoded(data, path.name), path.name)
     found = csv(path, None, {})
     if not found.count:
         raise InvalidProblem("the table has no rows", found.source, "give at least one row")
@@ -258,8 +257,33 @@ def _kraken(text: str, source: str) -> Table:
     return of_rows(rows, source, {})
 
 
-_LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = ((_KRAKEN, _kraken),)
-"""Pattern at the start of each log format, and its reader."""
+_Reader = Callable[[str, str], Table]
+_LOGS: tuple[tuple[re.Pattern[bytes], _Reader], ...] = (
+    (_KRAKEN, _kraken),
+    (pick_files.NONLINLOC, pick_files.nonlinloc),
+    (pick_files.HYPO71, pick_files.hypo71),
+    (pick_files.QUAKEML, pick_files.quakeml),
+    (detections.EVENTS, detections.sound_events),
+    (detections.CLIPS, detections.clips),
+)
+"""Pattern at the start of each log format, and its reader. A file of any name is recognised by its start."""
+# Bytes that are read to recognise a format: comments may be before the first line with data.
+_HEAD = 8192
+
+
+def _log_reader(path: Path) -> _Reader | None:
+    """Return the reader of a log format, by the start of the file; None for other files."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return None
+    return next((reader for begins, reader in _LOGS if begins.match(head)), None)
+
+
+def is_log(path: Path) -> bool:
+    """Return whether the start of a file has a log format, whatever its name is."""
+    return _log_reader(path) is not None
 
 
 # JSON records: one document, or one document on each line.

@@ -24,6 +24,7 @@ from optloc.files.stations import numbers_of
 from optloc.files.table import Epochs, Table
 from optloc.files.words import distinct, numbered
 from optloc.models import Model
+from optloc.problem.phases import Combination
 from optloc.problem.signal import Signal
 
 ESTIMATE = "estimate"
@@ -77,6 +78,10 @@ class RowChunk:
         Date of the magnetic declination.
     declination : array, optional
         Declination at that date at the stations of the present rows, radians; included in the corrections.
+    vp_vs : float, optional
+        For arrivals with a phase: the speed of P waves divided by the speed of S waves.
+    combination : Combination, optional
+        For combinations of such arrivals: the source of their noise.
     """
 
     kind: str
@@ -103,6 +108,8 @@ class RowChunk:
     table: Table
     declined_on: date | None = None
     declination: Array | None = None
+    vp_vs: float | None = None
+    combination: Combination | None = None
 
     @property
     def depends_on_speed(self) -> bool:
@@ -189,13 +196,18 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess and _is_range_sum(model), table, day,
+        section.excess and _is_range_sum(model), table, day, vp_vs=section.vp_vs,
     )  # fmt: skip
 
 
 def _check_options(c: Context, kind: str, model: Model) -> None:
     """Raise InvalidProblem for an option of a section that its kind does not use."""
     section = c.section
+    if section.vp_vs is not None and (kind != "toa" or not c.table.has("phase")):
+        advice = 'use the kind "toa" with a column phase, or remove the key'
+        raise InvalidProblem("vp_vs is for arrivals with a phase", join(c.where, "key 'vp_vs'"), advice)
+    if section.vp_vs is not None and section.sigma == ESTIMATE:
+        raise InvalidProblem("P and S arrivals need a stated sigma", join(c.where, "key 'sigma'"), 'write "0.1 s"')
     if section.kind is None:
         return  # settings of a table of several kinds apply to the kinds that use them
     if section.excess and not _is_range_sum(model):

@@ -36,6 +36,7 @@ from optloc.files.measurements import (
     with_baseline,
     with_declination,
 )
+from optloc.files.phase_rows import combined_noise, split_phases
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import ProblemFile, name_of, read_document
@@ -270,18 +271,18 @@ def assemble(
     )
     check_speed(file, chunks, groups, stations, source)
     # Convert excess paths to path sums now, since the station positions are known.
-    chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
-    chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
-    if azimuths:
-        azimuths += declination_text(chunks)
+    pairs = [(_add_baseline(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
+    chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
+    chunks, index, target = split_phases(chunks, index, target, source)
+    azimuths += declination_text(chunks) if azimuths else ""
     rows, numbers = _rows(chunks, index, target)
-    noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
     biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
     units = {bias.name: unit for bias, unit in biases if unit[0]}  # no entry for rows in several units
     all_biases = tuple(bias for bias, _ in biases)
     all_biases += speed_bias(file, written, all_biases, source)
     demands = {**(limits_of(file, None, source) if limits is None else limits), **demands_of(more or {})}
+    noise = _noise(file, chunks, numbers, index, target, source)
     problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, demands)
     # The estimation of noise needs fixes, so do it last.
     problem, levels = with_noise(file, problem, source)
@@ -416,7 +417,7 @@ def _noise(
     if file.covariance is None:
         return noise_of(chunks, numbers, index, target)
     place = join(source, "key 'covariance'")
-    if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal)):
+    if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal, c.combination)):
         raise InvalidProblem("the noise is given more than once", place, "remove the noise of the single measurements")
     matrix = square(file.covariance, place)
     slope = np.concatenate([chunk.slope for chunk in chunks])
@@ -430,7 +431,7 @@ def noise_of(
 
     `numbers`, `epochs` and `targets` are the global row number, epoch and target (m,) of each row, for each chunk.
     """
-    blocks: list[Block] = []
+    blocks = combined_noise(chunks, numbers)
     for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
         if chunk.sigma is not None:
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
@@ -443,7 +444,7 @@ def noise_of(
             blocks += [Block(number[m], _by_signal(chunk, chunk.signal, m)) for m in members]
         elif chunk.covariance is not None:
             blocks.append(_per_epoch_block(chunk, number, epoch, chunk.covariance))
-        else:
+        elif chunk.combination is None:
             advice = "give sigma, arrival_sigma, covariance or snr, or rows with a column sigma"
             raise InvalidProblem("the measurements have no noise", chunk.table.source, advice)
     return group(blocks)
@@ -524,7 +525,6 @@ def _check(problem: Problem, source: str, medium: Medium | None = None) -> Probl
     """Return the problem in its medium after all checks; an error names the file."""
     try:
         return checked(problem if medium is None else problem.in_medium(medium))
-    # Add the name of the file to an error of the problem.
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
 

@@ -54,8 +54,11 @@ def uses_of(
     stated standard deviation of each sort; None if a column of the table has it.
     """
     out = {name: one.form.kind for one in found for name in one.columns}
-    long = len(out) == len(found)  # a table with one reading in each row has one column for each sort
-    picks = any(one.form.value == "sp" for one in found)
+    # A table with one reading in each row has one column for each sort; picks may have a column for each wave.
+    picks = any(one.form.value in ("sp", "picks") for one in found)
+    long = picks or len(out) == len(found)
+    # A column whose readings were all left out is used as well, such as the zeros of a reference station.
+    out |= {name: one.form.kind for one in found for name in one.headers}
     # The roles of S minus P: columns of P and S, a column of their difference, or columns of phase and time.
     by_phase = picks and roles.find("sp") is None and not (roles.find("p") and roles.find("s"))
     wanted = ["phase"] if by_phase else ["sp"] if roles.find("sp") is not None else ["p", "s"]

@@ -142,6 +142,9 @@ class MeasurementsTable(DataTable):
     """Whether ranges are times of the way there and back."""
     turn_around: Amount | None = None
     """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
+    vp_vs: float | None = Field(default=None, gt=1.0)
+    """For arrivals (toa) with a column `phase`, P or S: speed of P waves, the propagation speed, divided by the speed
+    of S waves. Rows of one epoch have one origin time."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None

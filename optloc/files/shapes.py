@@ -20,6 +20,7 @@ from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, is_dated, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
+from optloc.files.picks import differences, read_picks
 from optloc.files.roles import ColumnPlaces, Roles, placed
 from optloc.files.settings import Units
 from optloc.files.table import Table
@@ -241,8 +242,8 @@ def read_long(
     `receivers` has the station of each row (n,) if no column has them. `forms` are all sorts of the table.
     """
     table = roles.table
-    if form.value == "sp" and roles.find("sp") is None:
-        return _picks(roles, hints, stations)
+    if form.value == "picks" or (form.value == "sp" and roles.find("sp") is None):
+        return _read_phases(roles, form, hints, stations)
     column = roles.column(form.value)
     dated = form.quantity == "length" and is_dated(table, column)
     cells = date_seconds(table, column, hints.zone) if dated else numbers(table, column)
@@ -257,6 +258,17 @@ def read_long(
     if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
     return _checked(found, roles, hints, stations, table.count - len(pick), positive)
+
+
+def _read_phases(roles: Roles, form: Form, hints: ColumnHints, stations: ColumnPlaces) -> Readings:
+    """Return the picks of P and S waves, or their differences for the form "sp"."""
+    if form.value == "sp":
+        return _checked(differences(roles, hints), roles, hints, stations, 0, "a-farther")
+    found = read_picks(roles, hints)
+    named = None if found.sigma is not None else sigma_column(roles, form, hints, [form])
+    if named is not None:
+        found = replace(found, sigma=sigma_of(roles.table, named, form, "s", found.row), errors=(named,))
+    return _checked(found, roles, hints, stations, 0, "a-farther")
 
 
 def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array) -> Readings:
@@ -282,58 +294,6 @@ def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array
     return ("a-farther" if is_reference else None), roles.labels("reference")
 
 
-def _picks(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> Readings:
-    """Return S minus P times, s, of a table with a column for each wave, or with a column of phases.
-
-    Stations without both waves are left out. Raise InvalidProblem if S is not after P.
-    """
-    table, zone = roles.table, hints.zone
-
-    def times(role: str) -> list[Decimal | None]:
-        """Return the times in the column of a role, s; None for an empty cell."""
-        column, unit = roles.column(role), "s"
-        dated = is_dated(table, column)
-        cells = date_seconds(table, column, zone) if dated else numbers(table, column)
-        if not dated:
-            unit, _ = unit_for(column, sort_named("sp"), hints, cells.values, table.source)
-        out: list[Decimal | None] = [None] * table.count
-        for row, value in zip(cells.row.tolist(), cells.values.tolist(), strict=True):
-            out[row] = in_unit(value, unit, "s", sort_named("sp"))
-        return out
-
-    station = roles.labels("station")
-    if roles.find("p") and roles.find("s"):
-        pairs = [(row, p, s) for row, (p, s) in enumerate(zip(times("p"), times("s"), strict=True))]
-    else:
-        phases, picked = [phase[:1].upper() for phase in roles.labels("phase").tolist()], times("time")
-        event = roles.labels("message").tolist() if roles.find("message") else [""] * table.count
-        first: dict[tuple[str, str, str], int] = {}
-        for row, key in enumerate(zip(event, station.tolist(), phases, strict=True)):
-            if key in first:
-                what = f"station {key[1]!r} has a second {key[2]} pick, first in row {first[key] + 1}"
-                advice = "remove one, or state the column of events with --column message=NAME"
-                raise InvalidProblem(what, table.at(row), advice)
-            first[key] = row
-        pairs = [
-            (row, picked[row], picked[first[label, name, "S"]])
-            for (label, name, phase), row in first.items()
-            if phase == "P" and (label, name, "S") in first
-        ]
-    both = [(row, s - p) for row, p, s in pairs if p is not None and s is not None]
-    early = next((row for row, value in both if value <= 0), None)
-    if early is not None:
-        raise InvalidProblem("the S wave is not after the P wave", table.at(early), "correct the picks")
-    if not both:
-        raise InvalidProblem("no station has both P and S", table.source, "state their columns with --column p=, s=")
-    differences = NumberColumn(Decimals.of([value for _, value in both]), np.array([row for row, _ in both]))
-    found = _of_column(sort_named("sp"), "s", differences, roles.find("s") or roles.column("time"), station)
-    n_without_pair = len({*station.tolist()}) - len({*found.a.tolist()})
-    found = replace(
-        found, notes=(f"{n_without_pair} stations without both P and S are left out",) if n_without_pair else ()
-    )
-    return _checked(found, roles, hints, stations, 0, "a-farther")
-
-
 # Checks for both forms: known stations, no missing readings, no repeats, sign and convention.
 
 
@@ -356,12 +316,7 @@ def _checked(
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
                 raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, stations.names))
     if found.b is not None:
-        same = np.flatnonzero(found.a == found.b)
-        if len(same):
-            spot = table.at(int(found.row[same[0]]))
-            raise InvalidProblem(
-                f"{found.form.kind} names station {found.a[same[0]]!r} twice", spot, "name two stations"
-            )
+        found = _without_reference(found, table)
     found = _with_digits(found, table)
     columns = [column for key, column in epochs_of(roles, hints, [found]).items()]
     _, epoch = equal_rows(columns, table.count)
@@ -378,6 +333,24 @@ def _checked(
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=hints.positive or positive or "a-farther")
     return _with_convention(found, hints, stations, table.source) if found.form.kind == "azimuth" else found
+
+
+def _without_reference(found: Readings, table: Table) -> Readings:
+    """Return differences without the rows of the reference station to itself, whose values are zero.
+
+    Raise InvalidProblem for such a row with another value, or if no other row exists.
+    """
+    same = np.asarray(found.a) == np.asarray(found.b)
+    wrong = np.flatnonzero(same & ((found.values.units != 0) | (found.form.kind != "tdoa")))
+    if len(wrong) or same.all():
+        item = int(wrong[0]) if len(wrong) else 0
+        spot = table.at(int(found.row[item]))
+        raise InvalidProblem(f"{found.form.kind} names station {found.a[item]!r} twice", spot, "name two stations")
+    if not same.any():
+        return found
+    names = ", ".join(dict.fromkeys(np.asarray(found.a)[same].tolist()))
+    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}"
+    return replace(found.take(np.flatnonzero(~same)), notes=(*found.notes, note))
 
 
 # Significant digits of a recent time in seconds or nanoseconds; rounding, m, that has no effect on a fix.
@@ -425,8 +398,10 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
     """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
-    long = len(taken) == len(found)  # a table with one reading in each row has one column for each sort
-    if found[0].form.value == "sp":
+    # A table with one reading in each row has one column for each sort; picks may have a column for each wave.
+    picks = found[0].form.value in ("sp", "picks")
+    long = picks or len(taken) == len(found)
+    if picks:
         taken |= {column for role in ("p", "s", "phase", "time") if (column := roles.find(role))}
     if long and (station := roles.find("station")):
         taken.add(station)

@@ -60,12 +60,14 @@ class Form:
 _SPECIAL_FORMS = {
     "arrivals": Form("toa", "toa", "arrival times"),
     "times": Form("toa", "time", "arrival times"),
+    "excess": Form("range_sum", "excess", "paths by way of the target, in excess of the direct path"),
+    "picks": Form("toa", "picks", "arrivals of P and S waves"),
     "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
 }
 
 
 def sort_named(name: str) -> Form:
-    """Return a sort of reading by name: "arrivals", "times" (arrivals in the time column), "sp" or a kind."""
+    """Return a sort of reading by name: a special form, such as "times" (arrivals in the time column), or a kind."""
     return _SPECIAL_FORMS[name] if name in _SPECIAL_FORMS else Form(name, name, MODELS[name].summary)
 
 
@@ -97,8 +99,8 @@ class ColumnHints:
         Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; for
         several kinds "range=10 cm,azimuth=2 deg".
     what : str, optional
-        Content of the table: "arrivals", "pseudoranges", "stations", "sp" or a measurement kind; by default from the
-        column names.
+        Content of the table: "arrivals", "picks" (P and S), "sp" (S minus P alone), "excess" (bistatic path minus the
+        direct path), "pseudoranges", "stations" or a measurement kind; by default from the column names.
     columns : mapping of str to str
         Column of each role whose name is not clear; "set+msg" joins two columns.
     ignore : tuple of str
@@ -124,7 +126,8 @@ class ColumnHints:
     reference : str, optional
         Reference station of differences in columns of single stations.
     vp, vs : str, optional
-        Speeds of the P and S waves, such as "6 km/s".
+        Speeds of the P and S waves, such as "6 km/s". For layers, `vp` is the path of a table with the columns depth,
+        vp and vs, and `vs` may be a ratio such as "vp/1.73".
     window : str, optional
         Time within which readings belong to one epoch, such as "0.1 s".
     still : bool
@@ -205,6 +208,8 @@ class Readings:
         Columns of these standard deviations.
     notes : tuple of str
         Assumptions, and readings that were left out.
+    phase : object array (m,), optional
+        Wave of each pick, "P" or "S".
     """
 
     form: Form
@@ -221,6 +226,7 @@ class Readings:
     sigma: Array | None = None
     errors: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    phase: Array | None = None
 
     def take(self, pick: Array) -> Readings:
         """Return the readings with the indices `pick`."""
@@ -232,6 +238,7 @@ class Readings:
             a=self.a[pick],
             b=None if self.b is None else self.b[pick],
             sigma=None if self.sigma is None else self.sigma[pick],
+            phase=None if self.phase is None else self.phase[pick],
         )
 
     def where(self, table: Table, item: int) -> str:
@@ -360,8 +367,9 @@ def without_ignored_columns(table: Table, ignored: Sequence[str]) -> Table:
 def sorts_of(roles: Roles, hints: ColumnHints) -> list[str]:
     """Return the names of the sorts of readings in a table with one reading in each row, such as "range" or "arrivals".
 
-    "times" means arrivals in the time column, and "sp" means times between P and S waves. The option `--as` takes
-    precedence over the names of the columns. The list is empty if the columns do not identify a sort.
+    "times" means arrivals in the time column, "picks" means P and S waves, and "sp" means times between them. The
+    option `--as` takes precedence over the names of the columns. The list is empty if the columns do not identify a
+    sort.
 
     Raises
     ------
@@ -370,11 +378,12 @@ def sorts_of(roles: Roles, hints: ColumnHints) -> list[str]:
     """
     if hints.what is not None:
         return ["times" if hints.what == "arrivals" and roles.find("toa") is None else hints.what]
-    if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
+    if roles.find("sp"):
         return ["sp"]
-    if roles.find("p") and roles.find("s") and roles.find("station"):
-        return ["sp"]
+    if roles.find("station") and (all(map(roles.find, ("time", "phase"))) or all(map(roles.find, ("p", "s")))):
+        return ["picks"]
     fitting = [name for name in _KINDS_BY_NAME if roles.find(name)]
+    fitting += ["excess"] if roles.find("excess") and "range_sum" not in fitting else []
     fitting += ["arrivals"] if roles.find("toa") else []
     if fitting or not (roles.find("station") and roles.find("time")):
         return fitting
@@ -560,7 +569,7 @@ def without_repeats(
     A repeat is a second reading of the same stations in one epoch. `epoch` (m,) is the number of epoch and target of
     each reading. `label` returns the epoch label of a table row.
     """
-    ends = [numbered(end)[1] for end in (found.a, found.b) if end is not None]
+    ends = [numbered(end)[1] for end in (found.a, found.b, found.phase) if end is not None]
     first, group = first_rows(epoch, *ends)  # the first reading of each group of repeats, and the group of each reading
     count = len(first)
     if count == len(found.values):

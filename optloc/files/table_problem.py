@@ -68,6 +68,8 @@ class TableProblem:
         Line of the constraint on the height, or empty.
     uses : mapping of str to str
         Role of each used column.
+    frame : tuple of str
+        Lines of the frame; empty for the frame of the stations.
     """
 
     source: Path
@@ -79,6 +81,7 @@ class TableProblem:
     after: tuple[str, ...] = ()
     height: str = ""
     uses: Mapping[str, str] = field(default_factory=dict)
+    frame: tuple[str, ...] = ()
 
     @property
     def as_read(self) -> dict[str, Any]:
@@ -125,7 +128,8 @@ class TableProblem:
         # JSON and TOML strings agree, except for escapes of characters beyond 16 bits; do not escape them.
         quoted = partial(json.dumps, ensure_ascii=False)
         lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
-        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", f'kind = "{self.places.frame}"']
+        frame = self.frame or (f'kind = "{self.places.frame}"',)
+        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", *frame]
         lines += ["", "[stations]", f"file = {quoted(names[0])}", f'unit = "{self.places.unit}"']
         for section, name in zip(self.sections, names[1:], strict=True):
             lines += ["", "[[measurements]]", f'kind = "{section.kind}"                         # {section.text}']

@@ -171,6 +171,9 @@ def _rows(original: Draft, table: Table, z: Array) -> dict[str, Any]:
     values = np.full((trials, table.count), np.nan)
     for chunk, number in zip(original.chunks, original.numbers, strict=True):
         if chunk.table is table:  # a table with several kinds has several chunks
+            if chunk.combination is not None:
+                what = "simulated P and S arrivals cannot be written"
+                raise InvalidProblem(what, table.source, "simulate P alone: remove the key vp_vs")
             values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
     known = {key: table.raw(key) for key in _COLUMNS if key != "z" and table.has(key)}
     columns: dict[str, Any] = {key: np.tile(column, trials) for key, column in known.items()}

@@ -327,6 +327,18 @@ def alternative_position(fix: Fix, x: Array) -> Array:
     return parts[0] if len(parts) == 1 else np.stack(parts)
 
 
+def alternative_latlon(fix: Fix, x: Array) -> Array | None:
+    """Return latitude, longitude (degrees) and ellipsoidal height (metres), (3,), of the position in a vector `x`.
+
+    For several targets the shape is (targets, 3). The result is None without a frame on Earth.
+    """
+    position = alternative_position(fix, x)
+    if fix.frame.kind == "cartesian":
+        return None
+    lat, lon, height = fix.frame.to_geodetic(position)
+    return np.stack([np.degrees(lat), np.degrees(lon), height], axis=-1)
+
+
 def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
     """Return one record for each bias of a single fix: name, member, value, sigma, unit, from_data.
 
@@ -377,7 +389,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "chart": _chart_json(fix),
         "determined": None if not is_shown(fix) or (known := fix.determined) is None else known.to_dict(),
         "alternatives": [
-            {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
+            _alternative(fix, x, gap, doubt)
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
         ],
         "explanations": [asdict(explanation) for explanation in explanations_of(fix)],
@@ -388,6 +400,13 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "not_separable": [] if seen is None else list(seen.sentences),
         "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
     }
+
+
+def _alternative(fix: Fix, x: Array, gap: float, doubt: float) -> dict[str, Any]:
+    """Return the record of an alternative with the vector `x`; on Earth with latitude, longitude and height."""
+    on_earth = alternative_latlon(fix, x)
+    record = {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
+    return record if on_earth is None else record | {"latlon": on_earth}
 
 
 def _chart_json(fix: Fix) -> dict[str, Any] | None:

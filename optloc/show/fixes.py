@@ -32,6 +32,7 @@ from optloc.show.columns import (
     UNCHECKED,
     Columns,
     active_of,
+    alternative_latlon,
     alternative_position,
     bias_records,
     explanations_of,
@@ -329,9 +330,15 @@ def alternative_sheet(fix: Fix) -> FixSheet | None:
     rows = []
     for i, (x, gap, doubt) in enumerate(zip(*others, strict=True)):
         # Print at most six coordinates: the two positions of a pair of targets.
-        point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
+        on_earth = alternative_latlon(fix, x)
+        if on_earth is None:
+            point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
+        else:
+            places = on_earth.reshape(-1, 3)[:2].tolist()
+            point = ", ".join(f"{lat:.6f}, {lon:.6f}, {height:.1f}" for lat, lon, height in places)
         rows.append((str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}"))
-    return FixSheet("Alternatives", ("#", "position, m", "cost gap", "probability"), rows)
+    what = "position, m" if fix.frame.kind == "cartesian" else "latitude, longitude, height in m"
+    return FixSheet("Alternatives", ("#", what, "cost gap", "probability"), rows)
 
 
 def count_sheet(columns: Columns, title: str) -> FixSheet:

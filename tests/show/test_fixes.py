@@ -4,8 +4,21 @@ import numpy as np
 import pytest
 from show.ranging import ranged
 
+import optloc
 from optloc.base.records import join
-from optloc.show.fixes import as_p, count_sheet, dict_of, fix_sheet, frame_of, geojson_of, html_of, text_of, with_sigma
+from optloc.show.columns import fix_detail
+from optloc.show.fixes import (
+    alternative_sheet,
+    as_p,
+    count_sheet,
+    dict_of,
+    fix_sheet,
+    frame_of,
+    geojson_of,
+    html_of,
+    text_of,
+    with_sigma,
+)
 
 
 @pytest.mark.parametrize(
@@ -52,3 +65,18 @@ def test_other_forms_hold_the_same_position():
 def test_a_p_value_is_short_and_absent_without_redundancy():
     assert as_p(np.nan) == "-"
     assert float(as_p(0.25)) == 0.25
+
+
+def test_alternatives_on_earth_have_latitude_longitude_and_height():
+    site = optloc.Frame.enu(lat_deg=47.0, lon_deg=8.0)
+    places = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 0.0], [0.0, 900.0, 0.0]])
+    rows = optloc.measured("range", np.linalg.norm(places - [300.0, 400.0, 200.0], axis=1), a=[0, 1, 2], sigma=1.0)
+    fix = optloc.solve(optloc.assemble(places, rows, frame=site))
+    mirror = site.to_geodetic(fix.position * [1.0, 1.0, -1.0])
+    (other,) = fix_detail(fix)["alternatives"]
+    assert other["latlon"] == pytest.approx([*np.degrees(mirror[:2]), mirror[2]], abs=1e-6)
+    sheet = alternative_sheet(fix)
+    assert sheet is not None
+    assert sheet.head[1] == "latitude, longitude, height in m"
+    plain = optloc.solve(optloc.assemble(places, rows))
+    assert "latlon" not in fix_detail(plain)["alternatives"][0]
