@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from optloc.files.constraint_files import StatedConstraint as StatedConstraint
     from optloc.files.constraint_reader import limits_of as limits_of
     from optloc.files.constraint_table import ConstraintTable as ConstraintTable
-    from optloc.files.long_table import from_table as from_table
     from optloc.files.convert import load_table as load_table
+    from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (
         Context as Context,
         ends_of as ends_of,
