@@ -581,8 +581,7 @@ def from_table(
     InvalidProblem
         The message names the row and column.
     """
-    names = dict(columns or {})
-    settings_of_stations: Any = station_options or {}
+    names, settings_of_stations = dict(columns or {}), dict[str, Any](station_options or {})
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
     places = station_table(stations, "stations", names=settings_of_stations.get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
@@ -591,7 +590,7 @@ def from_table(
         "format": 1,  # keeps the convention of azimuths of this function
         "propagation_speed": propagation_speed,
         "frame": place,
-        "stations": dict(settings_of_stations),
+        "stations": settings_of_stations,
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},

@@ -19,6 +19,7 @@ from optloc.linear.constraints import (
     Level,
     bounds,
     exact,
+    is_admitted,
     is_exact,
     is_flat,
     levels,
@@ -140,7 +141,7 @@ class AdmittedPoints:
         flat = points.reshape(-1, points.shape[-1])
         moved = np.repeat(self.x[None], len(flat), axis=0)
         moved[:, self.part] += flat
-        return np.asarray((violation(self.problem, moved) <= TOLERANCE).reshape(points.shape[:-1]))
+        return is_admitted(self.problem, moved).reshape(points.shape[:-1])
 
 
 def _regions(problem: Problem, x: Array, spread: Array, part: slice) -> Array | None:
