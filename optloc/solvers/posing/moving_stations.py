@@ -13,7 +13,7 @@ from optloc.base.types import Array
 from optloc.linear.vectors import vectors
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.doppler import limited_rows
 from optloc.solvers.starts.registration import place_states, run_of, run_starts, steady_blocks
 from optloc.solvers.starts.registration_windows import has_windows, windows_of
