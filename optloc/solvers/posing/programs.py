@@ -31,5 +31,5 @@ def pose_pulses(problem: Problem, locate: Locate) -> ConicStatement:
     raise InvalidProblem(
         "the nuclear norm states networks of stations at unknown positions",
         "formulation",
-        "use optloc.calibrate, or the functions of formulations.nuclear_norm",
+        "use optloc.sites.calibration.pose_network",
     )
