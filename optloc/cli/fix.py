@@ -39,6 +39,7 @@ from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
 from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.model_checks.plausibility import CHECKS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
@@ -120,7 +121,8 @@ def run_fix(
     level = rescaled or _level_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
-    advice = advice_for_fixes(found)
+    told = {check.name for check in CHECKS} if loaded.warnings else set()  # these sentences are printed before the fix
+    advice = tuple(one for one in advice_for_fixes(found) if one.cause not in told)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}

@@ -6,6 +6,7 @@ does not cover.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Stations
+from optloc.base.types import Amount, Array, Band, Stations, Status
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.declination import declination_of, declinations
@@ -27,6 +28,7 @@ from optloc.files.schema import FrameTable, StationsTable, Units
 from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
 from optloc.linear import constraints
+from optloc.model_checks.plausibility import refuse_impossible, suspicious_values
 from optloc.models import MODELS
 from optloc.models.medium import Medium
 from optloc.problem.bias import scale_of
@@ -230,7 +232,24 @@ def locate(
     problem, labels = _problem_of(
         stations, latlon, given, sigma, unit, reference, height, frame, through, speed_sigma, north
     )
-    return _labelled(solve(problem, method=method), labels)
+    refuse_impossible(problem, lambda _: "ranges", "python")
+    fix = solve(problem, method=method)
+    if (np.asarray(fix.code) != Status.OK).any():  # values of another unit fit no position, so these checks may wait
+        _warn(problem, unit, "toa" in given, through)
+    return _labelled(fix, labels)
+
+
+def _warn(problem: Problem, unit: Any, timed: bool, through: float | Medium) -> None:
+    """Warn about values that are physically suspicious.
+
+    `unit` is the argument of `locate`. `timed` is whether there are times of arrival. `through` is the propagation
+    speed, m/s, or the medium.
+    """
+    speed = through.unit_speed if isinstance(through, Medium) else through
+    unit_of_times = unit if unit is None or isinstance(unit, str) else unit.get("toa")
+    step = conversion(unit_of_times or "s", "length", propagation_speed=speed).factor if timed else 0.0
+    for one in suspicious_values(problem, "python", units={"toa": step} if timed else {}, speed=speed):
+        warnings.warn(f"{one.seen}; {one.advice}", UserWarning, stacklevel=3)
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +27,10 @@ from optloc.files.measurements import (
     chunks_of,
     declination_text,
     square,
-    with_baseline,
     with_declination,
+    with_station_distance,
 )
+from optloc.files.physics import warnings_of
 from optloc.files.propagation import medium_in, speed_bias, speed_of
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import (
@@ -96,6 +97,8 @@ class Loaded:
         Convention of azimuths, and the setting that changes it; empty without azimuths.
     table : mapping
         Interpretation of a measurement table, as a JSON value; empty for a problem file.
+    warnings : tuple of str
+        Sentences on values that are physically suspicious.
     """
 
     problem: Problem
@@ -109,6 +112,7 @@ class Loaded:
     bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     azimuths: str = ""
     table: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
@@ -141,6 +145,11 @@ class Draft:
     chunks: tuple[RowChunk, ...]
     numbers: tuple[Array, ...]
     moving: bool
+
+    def plausible(self, surface: str) -> Loaded:
+        """Return the problem with warnings on suspicious values; raise InvalidProblem for impossible values."""
+        found = warnings_of(self.loaded.problem, self.chunks, self.numbers, surface, self.loaded.source)
+        return replace(self.loaded, warnings=found)
 
 
 def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:
@@ -181,7 +190,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     InvalidProblem
         As in `load`.
     """
-    loaded = draft(Path(path), values=values, more=more or {}).loaded
+    loaded = draft(Path(path), values=values, more=more or {}).plausible("file")
     p = loaded.problem
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
@@ -248,7 +257,7 @@ def assemble(
         found, file.stations, epochs, [_stations_used(c, i) for c, i in zip(chunks, index, strict=True)]
     )
     # Convert excess paths to path sums now, since the station positions are known.
-    chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
+    chunks = [with_station_distance(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
     if azimuths:
         azimuths += declination_text(chunks)
@@ -330,15 +339,6 @@ def _stations_used(chunk: RowChunk, epoch: Array) -> Array:
     """Return the pairs (epoch, station) (u, 2) whose position the present rows of a chunk need."""
     pairs = [np.stack([epoch, station], axis=-1)[(station >= 0) & (chunk.weight > 0)] for station in (chunk.a, chunk.b)]
     return np.concatenate(pairs)
-
-
-def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
-    """Return a chunk with excess paths converted to path sums: the distance of the stations is added."""
-    if not chunk.excess:
-        return chunk
-    place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
-    rows = np.arange(len(epoch))
-    return with_baseline(chunk, np.linalg.norm(place[rows, chunk.a] - place[rows, chunk.b], axis=-1))
 
 
 def _rows(
@@ -595,4 +595,6 @@ def from_table(
         "constraints": [dict(constraint) for constraint in constraints],
     }
     file = validate(settings, "arguments")
-    return assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
+    return (
+        assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).plausible("file").problem
+    )
