@@ -45,8 +45,9 @@ if TYPE_CHECKING:
     from optloc.base.frames import Frame as Frame
     from optloc.base.types import Motion as Motion, Stations as Stations, Status as Status
     from optloc.bounds.cramer_rao import crlb as crlb
+    from optloc.files.long_table import from_table as from_table
     from optloc.files.one_call import locate as locate
-    from optloc.files.reader import from_table as from_table, load as load
+    from optloc.files.reader import load as load
     from optloc.lab import datasets as datasets
     from optloc.linear import constraints as constraints
     from optloc.linear.simulate import simulate as simulate

@@ -74,6 +74,20 @@ def moved(name: str) -> Any:
     return import_module(place) if name in _MODULES else getattr(import_module(package), inner)
 
 
+def renamed(old: str, given: Any, new: str, value: Any) -> Any:
+    """Return the value of a renamed argument, with a deprecation warning if the old name is used.
+
+    `given` is the value under the old name and `value` under the new name; None means that it is not given.
+    """
+    if given is None:
+        return value
+    if value is not None:
+        raise TypeError(f"{old} is the old name of {new}: give one of them")
+    text = f"the argument {old} is {new} now; version 0.2 removes the old name"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)
+    return given
+
+
 def _warn(old: str, new: str, level: int) -> None:
     """Warn that a name is old; `level` is the number of calls between this function and the code of the user."""
     warnings.warn(f"{old} is {new} now; version 0.2 removes the old name", DeprecationWarning, stacklevel=level)

@@ -261,6 +261,11 @@ class Band:
     along : bool
         Whether the constraint applies at every epoch of a run (for a height, minus its known `rise`), or at the
         reference time only.
+    other : int, optional
+        Number of a second target, for a quantity of two targets.
+    table : object, optional
+        Immutable data of the quantity that are no coefficients, for instance a grid of heights. It needs a property
+        `digest` that differs for different data.
     """
 
     kind: str
@@ -270,6 +275,8 @@ class Band:
     name: str
     target: int = 0
     along: bool = False
+    other: int | None = None
+    table: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,11 +291,37 @@ class Polygon:
         Name in reports.
     target : int
         Number of the target.
+    outside : bool
+        Whether the target is outside the polygon instead.
     """
 
     vertices: Array
     name: str = "polygon"
     target: int = 0
+    outside: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AnyOf:
+    """A constraint: a union of regions, of which at least one contains the target.
+
+    Parameters
+    ----------
+    members : tuple of tuples of Band
+        The regions. Each is a conjunction: a target is in it if it satisfies all of its bands.
+    name : str
+        Name in reports.
+    target : int
+        Number of the target.
+    """
+
+    members: tuple[tuple[Band, ...], ...]
+    name: str = "any of"
+    target: int = 0
+
+
+Constraint = Band | Polygon | AnyOf
+"""A condition that an answer must meet."""
 
 
 @dataclass(frozen=True, slots=True)

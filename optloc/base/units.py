@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.sound import sound_in_air, sound_in_water
 
 __all__ = [
     "LARGEST",
@@ -353,59 +354,6 @@ def in_si(value: Any, quantity: Quantity, where: str, *, deviation: bool = False
         numbers = [in_si(str(each), quantity, where, deviation=deviation, place=place) for each in value.flat]
         return np.reshape(numbers, value.shape)
     return value
-
-
-# Ranges of validity of the formulas for the speed of sound: temperatures, salinity and depth.
-_AIR, _WATER, _SALT, _DEEP = (-60.0, 60.0), (-2.0, 40.0), (0.0, 45.0), (0.0, 1000.0)
-
-
-def sound_in_air(celsius: float) -> float:
-    """Return the speed of sound in dry air, m/s, for an ideal gas with 331.3 m/s at 0 deg C.
-
-    In moist air it is at most 0.35 % higher at 20 deg C. A bias of the form "scale" can estimate this difference.
-
-    Raises
-    ------
-    InvalidProblem
-        For a temperature outside -60 to 60 deg C.
-    """
-    _check_range("the temperature of air", celsius, _AIR, "deg C")
-    return 331.3 * math.sqrt(1.0 + celsius / 273.15)
-
-
-def sound_in_water(celsius: float, salinity: float = 35.0, depth: float = 0.0) -> float:
-    """Return the speed of sound in water, m/s.
-
-    Parameters
-    ----------
-    celsius : float
-        Temperature, -2 to 40 deg C.
-    salinity : float
-        Grams of salt in a kilogram of water, 0 to 45; 35 in the sea, 0 in fresh water.
-    depth : float
-        Depth below the surface, 0 to 1000 metres.
-
-    Raises
-    ------
-    InvalidProblem
-        For values outside these ranges.
-
-    References
-    ----------
-    H. Medwin, "Speed of sound in water: a simple equation for realistic parameters", J. Acoust. Soc. Am. 58 (1975).
-    """
-    _check_range("the temperature of water", celsius, _WATER, "deg C")
-    _check_range("the salinity", salinity, _SALT, "g/kg")
-    _check_range("the depth", depth, _DEEP, "m")
-    pure = 1449.2 + 4.6 * celsius - 0.055 * celsius**2 + 0.00029 * celsius**3
-    return pure + (1.34 - 0.010 * celsius) * (salinity - 35.0) + 0.016 * depth
-
-
-def _check_range(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
-    """Raise if a value is outside the range of validity of a formula; `name` and `unit` describe it in the message."""
-    if not ends[0] <= value <= ends[1]:
-        what = f"{name} is {value:g} {unit}, outside {ends[0]:g} to {ends[1]:g}"
-        raise InvalidProblem(what, "propagation speed", "give the speed as a number, in metres per second")
 
 
 def _check_options(unit: str, quantity: str, propagation_speed: float, convention: str, where: str | None) -> None:

@@ -20,6 +20,7 @@ from optloc.cli.options import (
     Box,
     Budget,
     CommandGroup,
+    Constraint,
     EmitterCount,
     Explain,
     FalseRows,
@@ -123,6 +124,7 @@ def _options(
         "optloc fix site.toml --html map.html",
         "optloc fix site.toml --json | jq .fixes",
         "optloc fix site.toml --height '1640 ft'",
+        "optloc fix site.toml --constraint 'keep-out-disc lat=47.1 lon=8.2 radius=1 km'",
         "optloc fix toa.csv --stations sites.csv --sigma '20 ns'",
     ),
 )
@@ -138,6 +140,7 @@ def fix(
     height: Height = None,
     above_ground: AboveGround = False,
     box: Box = None,
+    constraint: Constraint = None,
     noise: NoiseFromData = None,
     rescale: RescaleNoise = False,
     late: LateFromData = False,
@@ -156,7 +159,7 @@ def fix(
     """
     from optloc.cli.fix import run_fix
 
-    more, passing = constraints(height, above_ground, box), allowed(allow)
+    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
         file,

@@ -31,6 +31,7 @@ from optloc.cli.output import (
 )
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
+from optloc.files.wave_speed import WaveOptions
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.model_checks.elements import By, batch_of
 from optloc.model_checks.geometry import Advice
@@ -70,7 +71,7 @@ def run_check(
     options: CheckOptions | None = None,
     *,
     quiet: bool = False,
-    table: ColumnHints | None = None,
+    table: ColumnHints | WaveOptions | None = None,
 ) -> int:
     """Print a summary of a file and the health of its stations; return exit code 1 if an epoch has too few rows."""
     options = options or CheckOptions()

@@ -23,7 +23,7 @@ from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
 from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
 from optloc.files.reader import Loaded, read
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.model_checks.evidence import Reliability, reliability
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, has_correlated_epochs, separable

@@ -32,9 +32,10 @@ from optloc.cli.output import (
     write_results,
     write_text,
 )
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded
-from optloc.files.schema import ConstraintTable
 from optloc.files.table_import import ColumnHints
+from optloc.files.wave_speed import WaveOptions
 from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
 from optloc.model_checks.geometry import Advice
@@ -87,14 +88,14 @@ def run_fix(
     late: bool = False,
     explain: bool = False,
     allow: tuple[Status, ...] = (),
-    table: ColumnHints | None = None,
+    table: ColumnHints | WaveOptions | None = None,
 ) -> int:
     """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
 
     `more` has the constraints by the name of their option. `as_json` prints JSON, and `quiet` prints nothing. `out`,
     `geojson_path`, `plot` and `html` are the files to write: results, GeoJSON, picture and page; None for no file.
-    `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table; None for a
-    problem file. Four options estimate the noise and the causes of misfits. `noise` is the grouping of
+    `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table, or the
+    options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the grouping of
     `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to the stated noise.
     `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
     """
@@ -181,6 +182,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
+    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed else []
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
     colour = _CARE if fix.unchecked and fix.status is Status.OK else _colour(Status(int(fix.code)))
     table.add_row("status", Text(rows[0][1], style=f"bold {colour}"))

@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optloc.base.errors import InvalidProblem
-from optloc.cli.options import Budget, Force, Json, Quiet, Verbose
+from optloc.cli.options import Budget, Force, Height, Json, Quiet, Verbose
+from optloc.cli.wave import WAVE_OPTIONS, wave_options
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from optloc.files.constraint_table import ConstraintTable
     from optloc.files.reader import Loaded
-    from optloc.files.schema import ConstraintTable
     from optloc.files.table_import import ColumnHints
     from optloc.files.table_problem import Converted, TableProblem
+    from optloc.files.wave_speed import WaveOptions
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq", ".rnx", ".obs")
 # RINEX observation files end in the year, such as site1230.21o.
@@ -145,7 +147,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-_FLAGS = ("average", "still", "turned")
+_FLAGS = ("average", "still", "turned", "two_way")
 
 
 def takes_table(command: Callable[..., None]) -> Callable[..., None]:
@@ -157,13 +159,14 @@ def takes_table(command: Callable[..., None]) -> Callable[..., None]:
         """Run the command with the values of the table options as one mapping."""
         given = {name: values.pop(name) for name in _OPTIONS}
         named = {"columns": columns_of(given["columns"]), "ignore": tuple(given["ignore"] or ())}
-        command(**values, given=given | named)
+        wave = wave_options(values)
+        command(**values, given=given | named | {"wave": wave})
 
     # typer reads the options from the signature: replace the parameter `given` by one parameter for each table option.
     kept = [entry for entry in command_signature.parameters.values() if entry.name != "given"]
     table_options = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=False if name in _FLAGS else None, annotation=kind)
-        for name, kind in _OPTIONS.items()
+        for name, kind in {**_OPTIONS, **WAVE_OPTIONS}.items()
     ]
     taking.__signature__ = command_signature.replace(parameters=[*kept, *table_options])  # type: ignore[attr-defined]  # what typer reads
     taking.__annotations__ = {entry.name: entry.annotation for entry in (*kept, *table_options)}
@@ -193,6 +196,7 @@ def convert(
             metavar="FILE", help="Table of measurements; satellite positions are computed at its times (UTC)."
         ),
     ] = None,
+    height: Height = None,
     as_json: Json = False,
     budget: Budget = None,
     force: Force = False,
@@ -201,7 +205,7 @@ def convert(
     given: Any = None,
 ) -> None:
     """Convert a table of measurements, stations or orbits to a problem file, and print how it is understood."""
-    raise typer.Exit(_run(file, out, {**given, "times": times}, as_json, quiet))
+    raise typer.Exit(_run(file, out, {**given, "times": times, "height": height}, as_json, quiet))
 
 
 def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
@@ -285,28 +289,29 @@ def _json(found: Converted) -> dict[str, Any]:
 # Tables instead of problem files.
 
 
-def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | None:
-    """Return the column hints of a table; None for a problem file.
+def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptions:
+    """Return the column hints of a table; for a problem file, the options on the wave.
 
-    `given` has the values of the table options. Raise InvalidProblem for a problem file with such options.
+    `given` has the values of the table options. Raise InvalidProblem for a problem file with options of tables.
     """
     from optloc.files.table_import import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
         return ColumnHints(**given)
-    stated = [name for name, value in given.items() if value]
+    wave: WaveOptions = given["wave"]
+    stated = [name for name, value in given.items() if value and name != "wave"]
     if stated:
         flag = {"what": "--as", "columns": "--column"}.get(stated[0], f"--{stated[0].replace('_', '-')}")
         what = f"this option is for a table; {file.name} is a problem file"
         raise InvalidProblem(
             what, flag, "write the setting in the file, or name a table with the ending .csv, .json or .parquet"
         )
-    return None
+    return wave
 
 
 def read_problem(
     file: Path,
-    hints: ColumnHints | None,
+    hints: ColumnHints | WaveOptions | None,
     more: Mapping[str, ConstraintTable] | None = None,
     *,
     values: bool = True,
@@ -317,14 +322,15 @@ def read_problem(
 
     For a table, print its interpretation, unless `quiet`; with `on_error`, print to standard error. `more` has further
     constraints by the name of their option. `values` requires measured values in a problem file. `hints` has the column
-    hints of a table; it is None for a problem file.
+    hints of a table, or the options on the wave of a problem file.
     """
     from optloc.cli.output import Screen
     from optloc.files.reader import read
+    from optloc.files.wave_speed import WaveOptions
 
     console = Screen(quiet=quiet, stderr=on_error)
-    if hints is None:
-        loaded = read(file, values=values, more=more)
+    if hints is None or isinstance(hints, WaveOptions):
+        loaded = read(file, values=values, more=more, wave=hints)
     else:
         from optloc.files.convert import interpret_table
 

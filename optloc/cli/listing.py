@@ -127,6 +127,22 @@ def _kinds() -> Rows:
     ]
 
 
+def _constraints() -> Rows:
+    """Return the rows of the list of constraints, with the keys of their tables and an example of the option."""
+    from optloc.files.constraint_kinds import kind_names, kind_of
+
+    found = {name: kind for name in kind_names() if (kind := kind_of(name)) is not None}
+    return [
+        {
+            "constraint": name,
+            "keys": " ".join(kind.keys),
+            "example": f"--constraint '{kind.example}'" if kind.example else "",
+            "summary": kind.summary,
+        }
+        for name, kind in found.items()
+    ]
+
+
 def _solvers() -> Rows:
     """Return the rows of the list of solvers, and of the installed back ends."""
     from optloc.solvers.back_ends import backends
@@ -142,6 +158,7 @@ def _solvers() -> Rows:
 
 _LISTS: dict[str, Callable[[], Rows]] = {
     "kinds": _kinds,
+    "constraints": _constraints,
     "formulations": registry("formulation", "optloc.solvers:FORMULATIONS"),
     "solvers": _solvers,
     "methods": registry("method", "optloc.solvers:METHODS"),

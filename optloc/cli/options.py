@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextvars import copy_context
 from importlib.resources import files
 from io import TextIOWrapper
@@ -27,7 +27,7 @@ from optloc.base.units import LARGEST
 from optloc.kernels.progress import keep_quiet
 
 if TYPE_CHECKING:
-    from optloc.files.schema import ConstraintTable
+    from optloc.files.constraint_table import ConstraintTable
 
 BAD_INPUT = 2
 """Exit code for wrong arguments or a wrong file; shells and typer use the same code."""
@@ -320,6 +320,16 @@ Box = Annotated[
         help="Region of the target, metres in the frame: X,Y[,Z]:X,Y[,Z]; inf means no bound.",
     ),
 ]
+Constraint = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--constraint",
+        metavar="'KIND KEY=VALUE ...'",
+        help="Limit of the position or velocity, such as 'disc x=3 km y=2 km radius=500 m'. Repeat the option for "
+        "more limits; see [bold]optloc list constraints[/bold].",
+        autocompletion=complete("constraints"),
+    ),
+]
 NoiseFromData = Annotated[
     str | None,
     typer.Option(
@@ -378,7 +388,9 @@ def allowed(text: str | None) -> tuple[Status, ...]:
     return tuple(status_named(one) for one in text.split(",")) if text else ()
 
 
-def constraints(height: str | None, above_ground: bool, box: str | None) -> dict[str, ConstraintTable]:
+def constraints(
+    height: str | None, above_ground: bool, box: str | None, texts: Sequence[str] = ()
+) -> dict[str, ConstraintTable]:
     """Return the constraints that options add to a file, by the name of the option.
 
     Parameters
@@ -389,8 +401,10 @@ def constraints(height: str | None, above_ground: bool, box: str | None) -> dict
         Whether the height is at least zero.
     box : str, optional
         Least and greatest coordinates, metres: ``0,0,-inf:5000,5000,inf``.
+    texts : sequence of str
+        Further constraints, such as ``disc x=3 km y=2 km radius=500 m``.
     """
-    from optloc.files.schema import ConstraintTable  # the help needs no schema
+    from optloc.files.constraint_table import ConstraintTable, constraint_of_text  # the help needs no schema
 
     found = {}
     if height is not None:
@@ -403,6 +417,10 @@ def constraints(height: str | None, above_ground: bool, box: str | None) -> dict
         advice = "write a corner as 1200,800 or 1200,800,50"
         low, high = (coordinates(corner, "--box", advice, bounds=True) for corner in box.split(":", 1))
         found["--box"] = ConstraintTable(kind="box", min=low, max=high)
+    for i, text in enumerate(texts):
+        # The place in messages has a number only if there are several.
+        place = "--constraint" if len(texts) == 1 else f"--constraint {i + 1}"
+        found[place] = constraint_of_text(text, place)
     return found
 
 

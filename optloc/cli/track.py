@@ -33,6 +33,7 @@ from optloc.cli.output import (
 )
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
+from optloc.files.wave_speed import WaveOptions
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
@@ -110,7 +111,7 @@ def run_track(
     plot: Path | None = None,
     html: Path | None = None,
     quiet: bool = False,
-    table: ColumnHints | None = None,
+    table: ColumnHints | WaveOptions | None = None,
 ) -> int:
     """Track the targets of a file or a table, write the requested files, and return the exit code.
 

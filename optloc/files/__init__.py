@@ -24,6 +24,9 @@ if TYPE_CHECKING:
         write_text as write_text,
         written as written,
     )
+    from optloc.files.constraint_files import StatedConstraint as StatedConstraint
+    from optloc.files.constraint_reader import limits_of as limits_of
+    from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (
         Context as Context,
         ends_of as ends_of,
@@ -38,7 +41,6 @@ if TYPE_CHECKING:
         Loaded as Loaded,
         assemble as assemble,
         draft as draft,
-        from_table as from_table,
         load as load,
         read as read,
     )
@@ -52,8 +54,6 @@ if TYPE_CHECKING:
         SoundTable as SoundTable,
         SpeedTable as SpeedTable,
         StationsTable as StationsTable,
-        Units as Units,
-        join as join,
         kind_model as kind_model,
         name_of as name_of,
         parse_toml as parse_toml,
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
         validate as validate,
         validated as validated,
     )
+    from optloc.files.settings import Units as Units, join as join
     from optloc.files.stations import survey as survey
     from optloc.files.table import Table as Table, of_rows as of_rows, table_of as table_of
     from optloc.files.unknowns import FREE as FREE, places_of as places_of, settle_frame as settle_frame

@@ -31,7 +31,7 @@ from optloc.files.pseudoranges import is_gnss
 from optloc.files.reading_report import check_receivers, reading_lines, unused_columns, uses_of
 from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
 from optloc.files.table_import import (
     CONVENTIONS,
@@ -47,6 +47,7 @@ from optloc.files.table_import import (
     without_ignored_columns,
 )
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
+from optloc.files.table_wave import with_wave
 from optloc.files.words import equal_rows
 from optloc.files.writer import write_csv
 from optloc.models import MODELS, kind_named
@@ -155,7 +156,7 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
-    return table_problem
+    return with_wave(table_problem, hints.wave)
 
 
 def _of_table(source: Path, hints: ColumnHints) -> TableProblem:

@@ -15,7 +15,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.files.schema import DeclinationTable, Units
+from optloc.files.schema import DeclinationTable
+from optloc.files.settings import Units
 
 _DATE = re.compile(r"\s*(\d{4}-\d\d-\d\d)")
 _GIVE = 'give the declination as an angle, such as "4 deg"'

@@ -16,9 +16,10 @@ from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Stations
-from optloc.base.units import LARGEST, Conversion
+from optloc.base.units import LARGEST, UNITS, Conversion
 from optloc.files.declination import declination_of, declinations
-from optloc.files.schema import MeasurementsTable, Units, join, kind_model
+from optloc.files.schema import MeasurementsTable, kind_model
+from optloc.files.settings import Units, join
 from optloc.files.stations import numbers_of
 from optloc.files.table import Epochs, Table
 from optloc.files.words import distinct, numbered
@@ -103,6 +104,12 @@ class RowChunk:
     declined_on: date | None = None
     declination: Array | None = None
 
+    @property
+    def depends_on_speed(self) -> bool:
+        """Return whether the wave speed converts the values: they are times of a path, or frequencies."""
+        times = self.units.quantity == "length" and self.written_unit in UNITS["time"]
+        return times or (self.units.quantity == "speed" and self.written_unit == "Hz")
+
 
 @dataclass(frozen=True, slots=True)
 class Context:
@@ -154,10 +161,14 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     section, table = c.section, c.table
     model = kind_model(kind, join(c.where, "key 'kind'"))
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
-    units = Units(model.quantity, c.speed, section.carrier_hz, convention)  # type: ignore[arg-type]
+    there_and_back = kind == "range" and (section.two_way or section.turn_around is not None)
+    speed = 0.5 * c.speed if there_and_back else c.speed
+    units = Units(model.quantity, speed, section.carrier_hz, convention)  # type: ignore[arg-type]
     _check_options(c, kind, model)
     name = _unit(section, kind, c.where)
     unit = units.conversion(name, join(c.where, "key 'unit'"))
+    if there_and_back:
+        unit = _without_turn_around(c, unit, units.name(name))
     weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
     z = values_of(c, unit, weight)
@@ -193,11 +204,32 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
         )
     if section.positive == "b-farther" and not _is_difference(model):
         raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
+    if kind != "range" and (section.two_way or section.turn_around is not None):
+        key = "two_way" if section.two_way else "turn_around"
+        raise InvalidProblem(f"{kind} has no way back", join(c.where, f"key {key!r}"), "remove it; it is for range")
     if kind != "azimuth":
         north = section.azimuth not in {None, "east-counterclockwise"}
         key = "azimuth" if north else "declination" if section.declination is not None else None
         if key is not None:
             raise InvalidProblem(f"{kind} is not an azimuth", join(c.where, f"key {key!r}"), "remove the key")
+
+
+def _without_turn_around(c: Context, unit: Conversion, name: str) -> Conversion:
+    """Return the conversion of two-way times to ranges: half of the time without the turn-around, times the speed.
+
+    `unit` is the conversion of half of a time, and `name` the name of the unit. Raise InvalidProblem for a length, or
+    for a turn-around time that is negative.
+    """
+    place = join(c.where, "key 'two_way'" if c.section.two_way else "key 'turn_around'")
+    if name not in UNITS["time"]:
+        advice = f"give times, or remove the setting; the ranges are in {name}"
+        raise InvalidProblem("two-way ranges are times", place, advice)
+    if c.section.turn_around is None:
+        return unit
+    seconds = Units("time").plain(c.section.turn_around, None, place)
+    if seconds < 0.0:
+        raise InvalidProblem("the turn-around time is negative", place, 'write it as "2 ms"')
+    return replace(unit, offset=-0.5 * c.speed * seconds)
 
 
 def _is_range_sum(model: Model) -> bool:

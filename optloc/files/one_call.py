@@ -6,7 +6,6 @@ does not cover.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
@@ -18,17 +17,20 @@ from numpy.typing import ArrayLike
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Stations, Status
+from optloc.base.types import Amount, Array, Band, Constraint, Motion, Stations, Status
 from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
+from optloc.files.constraint_reader import StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
+from optloc.files.physics import warn_of_values
 from optloc.files.propagation import is_time
 from optloc.files.roles import with_standard_columns
-from optloc.files.schema import FrameTable, StationsTable, Units
+from optloc.files.schema import FrameTable, StationsTable
+from optloc.files.settings import Units
 from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
 from optloc.linear import constraints
-from optloc.model_checks.plausibility import refuse_impossible, suspicious_values
+from optloc.model_checks.plausibility import refuse_impossible
 from optloc.models import MODELS
 from optloc.models.medium import Medium
 from optloc.problem.bias import scale_of
@@ -53,6 +55,8 @@ _SURFACE = 6.3e6
 _TOO_FAR = 100.0
 # Caches of receivers and of unit conversions with standard deviations: repeated calls reuse them.
 _PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
+# Quantities whose bounds determine the level of a target.
+_LEVELS = ("height", "terrain")
 # Largest rounding of an instant as a float, as a share of its standard deviation; less has no effect.
 _STEP = 0.1
 
@@ -98,6 +102,7 @@ def locate(
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
     height: Amount | Sequence[Amount] | None = None,
+    constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
@@ -119,6 +124,7 @@ def locate(
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
     height: Amount | Sequence[Amount] | None = None,
+    constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
@@ -139,6 +145,7 @@ def locate(
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
     height: Amount | Sequence[Amount] | None = None,
+    constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
@@ -183,6 +190,9 @@ def locate(
     height : float, str, or (least, greatest), optional
         Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z if the
         frame is not on Earth.
+    constraints : sequence of constraints or mappings, optional
+        Constraints of `optloc.constraints`, or tables as in problem files, such as
+        ``{"kind": "disc", "lat": 47.1, "lon": 8.2, "radius": "2 km"}``.
     azimuth : "north-clockwise", "north-counterclockwise" or "east-counterclockwise"
         Zero direction and sense of bearings.
     declination : float, str or date, optional
@@ -230,26 +240,13 @@ def locate(
     _check_north(north, given)
     through, speed_sigma = _speed(speed), _speed_sigma(speed)
     problem, labels = _problem_of(
-        stations, latlon, given, sigma, unit, reference, height, frame, through, speed_sigma, north
+        stations, latlon, given, sigma, unit, reference, height, constraints, frame, through, speed_sigma, north
     )
     refuse_impossible(problem, lambda _: "ranges", "python")
     fix = solve(problem, method=method)
     if (np.asarray(fix.code) != Status.OK).any():  # values of another unit fit no position, so these checks may wait
-        _warn(problem, unit, "toa" in given, through)
+        warn_of_values(problem, unit, "toa" in given, through)
     return _labelled(fix, labels)
-
-
-def _warn(problem: Problem, unit: Any, timed: bool, through: float | Medium) -> None:
-    """Warn about values that are physically suspicious.
-
-    `unit` is the argument of `locate`. `timed` is whether there are times of arrival. `through` is the propagation
-    speed, m/s, or the medium.
-    """
-    speed = through.unit_speed if isinstance(through, Medium) else through
-    unit_of_times = unit if unit is None or isinstance(unit, str) else unit.get("toa")
-    step = conversion(unit_of_times or "s", "length", propagation_speed=speed).factor if timed else 0.0
-    for one in suspicious_values(problem, "python", units={"toa": step} if timed else {}, speed=speed):
-        warnings.warn(f"{one.seen}; {one.advice}", UserWarning, stacklevel=3)
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
@@ -318,6 +315,7 @@ def _problem_of(
     unit: Any,
     reference: str | None,
     height: Any,
+    limits: StatedConstraints,
     frame: str,
     through: float | Medium,
     speed_sigma: float | None,
@@ -341,8 +339,8 @@ def _problem_of(
         made = _rows(word, found, sigma_si, step, places, speed)
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
         rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
-    at = _heights(height, places, given)
-    problem = assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
+    found, motions = _constraints(height, limits, places, given, speed)
+    problem = assemble(places.stations, *rows, frame=places.frame, constraints=found, motions=motions, medium=medium)
     return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels
 
 
@@ -402,6 +400,31 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     made = station_array(found.position[order], found.names, axes=axes_of)
     extent = float(np.ptp(made.position, axis=-2).max())
     return _Receivers(made, frame_of_stations, geodetic and not table.has("height"), extent)
+
+
+def _constraints(
+    height: Any, limits: StatedConstraints, places: _Receivers, given: Mapping[str, Any], speed: float
+) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+    """Return the constraints of the target, and its motion.
+
+    `height` and `limits` are the arguments `height` and `constraints` of `locate`. `given` has the measurements by
+    argument, and `speed` is the propagation speed, m/s.
+    """
+    still = (Motion(),)
+    demands = stated_arguments(limits)
+    if not demands:
+        return _heights(height, places, given), still
+
+    def found(more: dict[str, Any]) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+        """Return the stated constraints together with `more`."""
+        return constraints_of(demands | more, places.stations, places.frame, still, ("target",), np.zeros(1), speed)
+
+    stated, motions = found({})
+    # A stated height or a terrain replaces the height 0 m of stations without altitudes.
+    level = any(isinstance(each, Band) and each.kind in _LEVELS for each in stated)
+    if height is None and level:
+        return stated, motions
+    return found({"height": _heights(height, places, given)})
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Bias
-from optloc.base.units import SPEED_OF_LIGHT, sound_in_air, sound_in_water
-from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable, Units, join
-from optloc.models.medium import Atmosphere, Layers, Medium
+from optloc.base.frames import Frame
+from optloc.base.sound import sound_in_air, sound_in_water
+from optloc.base.types import Array, Bias, Stations
+from optloc.base.units import SPEED_OF_LIGHT, UNITS
+from optloc.files.measurements import RowChunk
+from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable
+from optloc.files.settings import Units, join
+from optloc.files.wave_speed import StatedSpeed, stated_speed, wind_of
+from optloc.models.medium import Atmosphere, Layers, Medium, Wind
 from optloc.problem.bias import SPEED, scale_of
 
 # Keys of each kind of medium.
@@ -18,17 +25,51 @@ _MEDIA = {
 }
 
 
-def medium_in(file: ProblemFile, source: str) -> Medium | None:
-    """Return the medium of a problem file; None if the propagation speed is one number."""
-    return None if file.medium is None else _medium(file.medium, _stated_speed(file, source), source)
+def medium_in(
+    file: ProblemFile, source: str, frame: Frame | None = None, stations: Stations | None = None
+) -> Medium | None:
+    """Return the medium of a problem file; None if the propagation speed is one number.
+
+    A wind on Earth needs the `frame` and the `stations`, since the axes of an ECEF frame are not east and north.
+    """
+    stated = _stated(file, source)
+    if file.wind is None:
+        return None if file.medium is None else _medium(file.medium, None if stated is None else stated.speed, source)
+    place = join(source, "key 'wind'")
+    if file.medium is not None:
+        raise InvalidProblem("a wind needs one wave speed, and the file has [medium]", place, "remove one of them")
+    if stated is None or stated.sigma is not None:
+        what = "a wind needs a wave speed" if stated is None else "a wind needs a wave speed without a sigma"
+        raise InvalidProblem(what, place, 'write propagation_speed = "air:20C", or --wave-speed air:20C')
+    velocity = wind_of(file.wind, place)
+    if frame is not None and frame.kind == "ecef" and stations is not None:
+        middle = stations.position.reshape(-1, stations.dimension).mean(0)
+        axes = frame.enu_axes(middle)  # rows: east, north and up
+        velocity = tuple((np.array([*velocity, 0.0][:3]) @ axes).tolist())
+    try:
+        return Wind(velocity, stated.speed)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, place, error.advice) from None
 
 
 def speed_of(file: ProblemFile, source: str) -> float:
     """Return the speed that converts times to lengths, m/s; by default the speed of light."""
-    medium, stated = medium_in(file, source), _stated_speed(file, source)
+    medium, stated = medium_in(file, source), _stated(file, source)
     if medium is not None:
         return medium.unit_speed
-    return SPEED_OF_LIGHT if stated is None else stated
+    return SPEED_OF_LIGHT if stated is None else stated.speed
+
+
+def speed_words(file: ProblemFile, source: str) -> str:
+    """Return the wave speed of a problem file as text, for reports."""
+    medium, stated = medium_in(file, source), _stated(file, source)
+    if isinstance(medium, Wind):
+        assert stated is not None
+        parts = ", ".join(f"{v:.3g}" for v in medium.velocity)
+        return f"{stated.words}; wind ({parts}) m/s"
+    if medium is not None:
+        return medium.words
+    return f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)" if stated is None else stated.words
 
 
 def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
@@ -71,22 +112,34 @@ def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
         raise InvalidProblem(error.what, place, error.advice) from None
 
 
-def _stated_speed(file: ProblemFile, source: str) -> float | None:
-    """Return the propagation speed that a file states, m/s; None if it states none."""
+def _stated(file: ProblemFile, source: str) -> StatedSpeed | None:
+    """Return the propagation speed that a file states; None if it states none."""
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
-    if isinstance(given, SoundTable):
-        water = given.medium != "air"
-        # Grams of salt in a kilogram of water: sea water has 35 by default, other water none.
-        if not water and (given.salinity is not None or given.depth):
-            raise InvalidProblem("air has no salinity and no depth", place, "remove them")
-        usual = 35.0 if given.medium == "sea water" else 0.0
-        salinity = usual if given.salinity is None else given.salinity
-        return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
     if given is None:
         return None
+    if isinstance(given, SoundTable):
+        return _sound(given, place)
     if isinstance(given, SpeedTable):
-        return positive_speed(given.value, "speed", place)
-    return positive_speed(given, "speed", place)
+        speed, sigma = positive_speed(given.value, "speed", place), positive_speed(given.sigma, "sigma", place)
+        return StatedSpeed(speed, sigma, f"{speed:.9g} ± {sigma:.3g} m/s, estimated with the target")
+    if isinstance(given, str):
+        return stated_speed(given, place)
+    return StatedSpeed(positive_speed(given, "speed", place), None, f"{given:.9g} m/s")
+
+
+def _sound(given: SoundTable, place: str) -> StatedSpeed:
+    """Return the speed of sound in the medium of a table."""
+    water = given.medium != "air"
+    # Grams of salt in a kilogram of water: sea water has 35 by default, other water none.
+    if not water and (given.salinity is not None or given.depth):
+        raise InvalidProblem("air has no salinity and no depth", place, "remove them")
+    usual = 35.0 if given.medium == "sea water" else 0.0
+    salinity = usual if given.salinity is None else given.salinity
+    if not water:
+        speed = sound_in_air(given.celsius)
+        return StatedSpeed(speed, None, f"{speed:.6g} m/s, air of {given.celsius:g} °C")
+    speed = sound_in_water(given.celsius, salinity, given.depth)
+    return StatedSpeed(speed, None, f"{speed:.6g} m/s, {given.medium} of {given.celsius:g} °C")
 
 
 def positive_speed(given: float | str, what: str, place: str) -> float:
@@ -119,13 +172,64 @@ def speed_bias(
     `written` has the global row numbers (m,), the quantity and the unit of each set of values. `biases` are the other
     biases of the file.
     """
-    given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
-    if not isinstance(given, SpeedTable):
+    stated, place = _stated(file, source), join(source, "key 'propagation_speed'")
+    if stated is None or stated.sigma is None:
         return ()
     if file.medium is not None:
         raise InvalidProblem("the medium determines the speed", place, "remove the sigma")
     if any(bias.name == SPEED for bias in biases):
         raise InvalidProblem("the bias 'speed' is stated twice", place, "remove [[biases]] 'speed' or the sigma")
-    speed, sigma = positive_speed(given.value, "speed", place), positive_speed(given.sigma, "sigma", place)
     rows = [numbers for numbers, units, unit in written if is_time(units, unit, place)]
-    return (scale_of(speed, sigma, rows, place),)
+    return (scale_of(stated.speed, stated.sigma, rows, place),)
+
+
+# Times without a stated speed: light is the default, and wrong for times of sound.
+
+# A wave between 10 m/s and 10 km/s is sound or an earthquake; waves on a string are outside.
+_SLOWEST, _FASTEST = 10.0, 10e3
+# A noise of 100 times the size of the network leaves no information.
+_USELESS = 100.0
+
+
+def check_speed(
+    file: ProblemFile, chunks: Sequence[RowChunk], groups: Sequence[Array], stations: Stations, source: str
+) -> None:
+    """Raise InvalidProblem if times fit the network only as times of sound, and no wave speed is stated.
+
+    `groups` are the numbers (m,) of the epoch and target of each row of each chunk, for example of one message.
+    """
+    if file.propagation_speed is not None or file.medium is not None or stations.dimension < 2:
+        return
+    extent = float(np.nanmax(np.ptp(stations.position.reshape(-1, stations.dimension), axis=0), initial=0.0))
+    timed = [(chunk, group) for chunk, group in zip(chunks, groups, strict=True) if chunk.written_unit in UNITS["time"]]
+    for chunk, group in timed if extent > 0.0 else ():
+        if chunk.units.quantity != "length":
+            continue
+        longest, noise = _longest(chunk, group), _noise(chunk)
+        speed = SPEED_OF_LIGHT * extent / longest if longest > 0.0 else np.inf
+        if _SLOWEST < speed < _FASTEST or noise > _USELESS * extent:
+            what = f"light travels {max(longest, noise) / 1e3:.3g} km in these times, and no wave speed is stated"
+            advice = 'state it: --wave-speed air:20C, or propagation_speed = "air:20C" in a file; or correct the unit'
+            if source == "arguments":
+                advice = 'state it, such as wave_speed="air:20C", or correct the unit'
+            raise InvalidProblem(what, chunk.table.source, advice)
+
+
+def _longest(chunk: RowChunk, group: Array) -> float:
+    """Return the longest path of the rows of a chunk, m: for arrivals, the longest time after the first of a group."""
+    present = (chunk.weight > 0.0) & np.isfinite(chunk.z)
+    z, number = chunk.z[present], group[present]
+    if not len(z):
+        return 0.0
+    if chunk.kind != "toa":
+        return float(np.abs(z).max())
+    first = np.full(int(number.max()) + 1, np.inf)
+    np.minimum.at(first, number, z)
+    return float((z - first[number]).max())
+
+
+def _noise(chunk: RowChunk) -> float:
+    """Return the least standard deviation of the rows of a chunk, m; zero for other forms of noise."""
+    sigma = chunk.sigma if chunk.sigma is not None else chunk.arrival
+    positive = np.zeros(0) if sigma is None else sigma[sigma > 0.0]
+    return float(positive.min(initial=np.inf)) if len(positive) else 0.0

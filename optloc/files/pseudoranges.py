@@ -22,7 +22,7 @@ from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.broadcast import Ephemeris, ionosphere, orbit, troposphere, turned
 from optloc.files.rinex import SYSTEMS, WEEK, Observations, is_rinex, read_navigation, read_observations
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.table import Table, of_rows
 from optloc.problem.build import assemble, measured, station_array
 

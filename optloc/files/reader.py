@@ -11,15 +11,21 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, check_budget
 from optloc.base.types import Array, Bias, Rows, Stations
+from optloc.files.constraint_reader import (
+    Demand,
+    constraints_of,
+    demands_of,
+    limits_of,
+)
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.measurements import (
     ESTIMATE,
     RowChunk,
@@ -31,29 +37,22 @@ from optloc.files.measurements import (
     with_station_distance,
 )
 from optloc.files.physics import warnings_of
-from optloc.files.propagation import medium_in, speed_bias, speed_of
+from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
-from optloc.files.schema import (
-    ConstraintTable,
-    ProblemFile,
-    Units,
-    join,
-    name_of,
-    read_document,
-    validate,
-)
-from optloc.files.stations import over_epochs, station_table, survey
-from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
+from optloc.files.schema import ProblemFile, name_of, read_document
+from optloc.files.settings import Units, join
+from optloc.files.stations import over_epochs, survey
+from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
 from optloc.files.unknowns import (
     FREE,
     bias_of,
-    constraints_of,
     known_of,
     motions_of,
     needs_clock,
     places_of,
     prior_of,
 )
+from optloc.files.wave_speed import WaveOptions, with_options, with_profile
 from optloc.models import MODELS
 from optloc.models.medium import Medium
 from optloc.problem.noise import Block, Noise, arrivals, group, group_members
@@ -62,9 +61,6 @@ from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
 from optloc.station_health.levels import NoiseLevels
 from optloc.station_health.structure import with_estimated_noise
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 LOG = logging.getLogger("optloc.read")
 
@@ -99,6 +95,8 @@ class Loaded:
         Interpretation of a measurement table, as a JSON value; empty for a problem file.
     warnings : tuple of str
         Sentences on values that are physically suspicious.
+    speed : str
+        Wave speed, as text; empty if no value depends on it.
     """
 
     problem: Problem
@@ -113,6 +111,7 @@ class Loaded:
     azimuths: str = ""
     table: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    speed: str = ""
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
@@ -173,7 +172,13 @@ def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None
         return read(path).problem
 
 
-def read(path: str | Path, *, values: bool = True, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
+def read(
+    path: str | Path,
+    *,
+    values: bool = True,
+    more: Mapping[str, ConstraintTable] | None = None,
+    wave: WaveOptions | None = None,
+) -> Loaded:
     """Return the problem of a file with the names that results need.
 
     Parameters
@@ -184,27 +189,36 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
         Whether measured values are required; False for simulations and bounds.
     more : mapping of str to ConstraintTable, optional
         Constraints in addition to those of the file, by their place for messages.
+    wave : WaveOptions, optional
+        Options on the wave, which replace the statements of the file.
 
     Raises
     ------
     InvalidProblem
         As in `load`.
     """
-    loaded = draft(Path(path), values=values, more=more or {}).plausible("file")
+    loaded = draft(Path(path), values=values, more=more or {}, wave=wave).plausible("file")
     p = loaded.problem
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
 
 
-def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
+def draft(
+    path: Path,
+    *,
+    values: bool,
+    more: Mapping[str, ConstraintTable] | None = None,
+    wave: WaveOptions | None = None,
+) -> Draft:
     """Return the problem of a file together with its tables; the arguments are as in `read`."""
-    file, source = read_document(path), name_of(path)
+    file, source = with_options(read_document(path), wave), name_of(path)
+    file = with_profile(file, path.parent, source)
     # Read tables before converting anything, so that a missing file is reported before a wrong unit.
-    known = places_of(file, path.parent, source)
+    known, limits = places_of(file, path.parent, source), limits_of(file, path.parent, source)
     stations = table_of(file.stations, path.parent, join(source, "[stations]"))
     places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
     tables = [table_of(m, path.parent, place) for m, place in zip(file.measurements, places, strict=True)]
-    return assemble(file, stations, tables, source, values=values, known=known, more=more)
+    return assemble(file, stations, tables, source, values=values, known=known, limits=limits, more=more)
 
 
 def assemble(
@@ -215,6 +229,7 @@ def assemble(
     *,
     values: bool,
     known: Mapping[str | None, Table] | None = None,
+    limits: Mapping[str, Demand] | None = None,
     more: Mapping[str, ConstraintTable] | None = None,
 ) -> Draft:
     """Return the problem of settings and tables.
@@ -233,6 +248,8 @@ def assemble(
         Whether measured values are required.
     known : mapping of str to Table, optional
         Positions of known targets by name; None is the key of the single target.
+    limits : mapping of str to constraints, optional
+        The constraints by their place for messages, see `limits_of`; by default those of `file`.
     more : mapping of str to ConstraintTable, optional
         As in `read`.
     """
@@ -252,10 +269,12 @@ def assemble(
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
     index, target = np.split(epochs.index, cuts), np.split(epochs.target, cuts)
     check_repeats(chunks, index, target, found.names, epochs)
+    groups = [one + len(epochs.labels) * other for one, other in zip(index, target, strict=True)]
     # Positions of moving stations are needed only at epochs with rows of them; elsewhere they may be unknown.
     stations = over_epochs(
         found, file.stations, epochs, [_stations_used(c, i) for c, i in zip(chunks, index, strict=True)]
     )
+    check_speed(file, chunks, groups, stations, source)
     # Convert excess paths to path sums now, since the station positions are known.
     chunks = [with_station_distance(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in zip(chunks, index, strict=True)]
@@ -268,15 +287,15 @@ def assemble(
     units = {bias.name: unit for bias, unit in biases if unit[0]}  # no entry for rows in several units
     all_biases = tuple(bias for bias, _ in biases)
     all_biases += speed_bias(file, written, all_biases, source)
-    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, more or {})
-    # The estimation of noise needs fixes, and so the whole problem: do it last.
+    demands = {**(limits_of(file, None, source) if limits is None else limits), **demands_of(more or {})}
+    problem = _problem(file, epochs, stations, rows, noise, all_biases, frame, source, known or {}, demands)
+    # The estimation of noise needs fixes, so do it last.
     problem, levels = with_noise(file, problem, source)
-    title = file.title or source
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
-    loaded = Loaded(problem, source, title, *named, levels, units, azimuths)
-    return Draft(
-        loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _has_moving_target(problem)
-    )
+    words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
+    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words)
+    moving = found.moving or _has_moving_target(problem)
+    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 
 
 def _problem(
@@ -289,11 +308,11 @@ def _problem(
     frame: Frame,
     source: str,
     known: Mapping[str | None, Table],
-    more: Mapping[str, ConstraintTable],
+    demands: Mapping[str, Demand],
 ) -> Problem:
     """Return the checked problem with the motions, priors, constraints and medium of the file.
 
-    `known` has the positions of known targets by name. `more` has further constraints, by their place for messages.
+    `known` has the positions of known targets by name, and `demands` the constraints by their place for messages.
     """
     speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
@@ -301,12 +320,10 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
-    demands |= more
     constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     check_budget("unknowns", made.layout.n_shared, source)
-    return _check(made, source, medium_in(file, source))
+    return _check(made, source, medium_in(file, source, frame, stations))
 
 
 def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epochs:
@@ -512,89 +529,3 @@ def _check(problem: Problem, source: str, medium: Medium | None = None) -> Probl
 def _has_moving_target(problem: Problem) -> bool:
     """Return whether a known target moves: it has several positions."""
     return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
-
-
-# Problems from data frames in long form.
-
-
-def from_table(
-    table: pd.DataFrame | Mapping[str, ArrayLike],
-    stations: pd.DataFrame | Mapping[str, ArrayLike] | Stations,
-    *,
-    kind: str | None = None,
-    unit: str | Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
-    sigma: float | str | None = None,
-    motion: str | None = None,
-    frame: str | Mapping[str, object] = "cartesian",
-    window: str | None = None,
-    propagation_speed: float | None = None,
-    station_options: Mapping[str, object] | None = None,
-    constraints: Sequence[Mapping[str, object]] = (),
-    values: bool = True,
-    **options: object,
-) -> Problem:
-    """Return the problem of a long table with one row for each measurement.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame, or mapping of str to array (m,)
-        Columns ``kind, a, b, z`` and optionally ``epoch`` or ``time``, ``sigma``, ``target``, ``weight``,
-        ``correction``.
-    stations : pandas.DataFrame, mapping of str to array (s,), mapping of name to coordinates (d,), or Stations
-        A table with the columns ``name, x, y, z`` or ``name, lat_deg, lon_deg, height``; or positions by name.
-    kind : str, optional
-        Kind of all rows, if there is no column ``kind``.
-    unit : str or mapping of kind to str, optional
-        Unit of ``z``; by default SI.
-    columns : mapping of str to str, optional
-        Names of the columns in the table: ``{"z": "tdoa_ns"}``.
-    sigma : float or str, optional
-        Standard deviation of each row, in `unit` or as text with a unit: ``"30 ns"``.
-    motion : "static", "free", "free_velocity", "constant_velocity" or "constant_acceleration", optional
-        Motion of the target; by default static for one epoch, free for several.
-    frame : str or mapping
-        ``"cartesian"``, ``"ecef"``, ``"geodetic"``, or the table ``[frame]`` of a problem file.
-    window : str, optional
-        Length of an epoch, such as ``"0.1 s"``.
-    propagation_speed : float, optional
-        Metres per second; by default light in vacuum.
-    station_options : mapping, optional
-        Further keys of the table ``[stations]`` of a problem file, for instance ``{"unit": "km"}``.
-    constraints : sequence of mapping
-        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``.
-    values : bool
-        Whether measured values are required; False to simulate them.
-    **options
-        Further keys of a table ``[[measurements]]``: ``arrival_sigma``, ``azimuth``, ``positive`` and others.
-
-    Returns
-    -------
-    Problem
-        In SI units.
-
-    Raises
-    ------
-    InvalidProblem
-        The message names the row and column.
-    """
-    names = dict(columns or {})
-    settings_of_stations: Any = station_options or {}
-    place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
-    places = station_table(stations, "stations", names=settings_of_stations.get("columns"))
-    measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
-    # Arguments are read like a problem file with the name "arguments", so both use one reader.
-    settings = {
-        "format": 1,  # keeps the convention of azimuths of this function
-        "propagation_speed": propagation_speed,
-        "frame": place,
-        "stations": dict(settings_of_stations),
-        "measurements": [{key: value for key, value in measured.items() if value is not None}],
-        "epochs": {"window": window},
-        "target": {"motion": motion},
-        "constraints": [dict(constraint) for constraint in constraints],
-    }
-    file = validate(settings, "arguments")
-    return (
-        assemble(file, places, [of_frame(table, "table", names)], "arguments", values=values).plausible("file").problem
-    )

@@ -19,7 +19,8 @@ from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
 from optloc.files.csv_formats import read_table, records
-from optloc.files.schema import MeasurementsTable, ProblemFile, join
+from optloc.files.schema import MeasurementsTable, ProblemFile
+from optloc.files.settings import join
 from optloc.files.table import Table
 from optloc.files.words import Words, equal_rows, numbered, objects
 from optloc.models import BEARING, MODELS, kind_named

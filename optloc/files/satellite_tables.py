@@ -19,7 +19,7 @@ from optloc.files.orbits import read_orbits
 from optloc.files.pseudoranges import at_reception, received
 from optloc.files.reading_report import unused_columns
 from optloc.files.roles import ColumnPlaces, Roles, check_column_hints, places_of, scaled
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.shapes import sigma_column, sigma_of
 from optloc.files.table_import import ColumnHints, sort_named
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma

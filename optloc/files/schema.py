@@ -6,12 +6,11 @@ The docstring of a key is its description in the JSON schema and in the manual.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
@@ -20,99 +19,19 @@ from optloc.base.types import (
     FormName,
 )
 from optloc.base.units import (
-    SI_UNIT,
-    SPEED_OF_LIGHT,
     AzimuthConvention,
-    Conversion,
-    Quantity,
-    conversion,
-    example_of,
-    split_amount,
 )
+from optloc.files.constraint_table import ConstraintTable
+from optloc.files.settings import FileTable, join
 from optloc.models import MODELS, Model, kind_named
 
 # Names and amounts such as "30 ns".
-
-
-def join(*places: str | None) -> str:
-    """Return several places as one text, from the file inwards, for messages."""
-    return ", ".join(place for place in places if place)
 
 
 def kind_model(kind: str, where: str) -> Model:
     """Return the model of a kind, by its name or an alias; raise InvalidProblem for an unknown kind."""
     return MODELS[kind_named(kind, where)]
 
-
-@dataclass(frozen=True, slots=True)
-class Units:
-    """Quantity of a number, and the settings that its units depend on.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        Determines the permitted units.
-    speed : float
-        Propagation speed, metres per second.
-    carrier : float, optional
-        Carrier frequency, hertz.
-    convention : AzimuthConvention
-        Convention of azimuths.
-    """
-
-    quantity: Quantity
-    speed: float = SPEED_OF_LIGHT
-    carrier: float | None = None
-    convention: AzimuthConvention = "east-counterclockwise"
-
-    @property
-    def clockwise(self) -> bool:
-        """Return whether numbers grow clockwise, as with a compass."""
-        return self.convention == "north-clockwise"
-
-    def name(self, unit: str | None) -> str:
-        """Return the unit; None becomes the SI unit of the quantity."""
-        return SI_UNIT[self.quantity] if unit is None else unit
-
-    def conversion(self, unit: str | None, where: str) -> Conversion:
-        """Return the conversion of a unit to SI; None is the SI unit. `where` is the place for messages."""
-        return conversion(
-            self.name(unit),
-            self.quantity,
-            propagation_speed=self.speed,
-            carrier=self.carrier,
-            convention=self.convention,
-            where=where,
-        )
-
-    def amount(self, value: float | str, default: Conversion | None, where: str) -> tuple[float, Conversion]:
-        """Return the number of an amount and the conversion of its unit to SI.
-
-        Parameters
-        ----------
-        value : float or str
-            A number in the default unit, or a number and a unit: ``"30 ns"``.
-        default : Conversion, optional
-            Unit of a plain number; None rejects a plain number.
-        where : str
-            Place for messages.
-        """
-        number, unit = split_amount(value, self.quantity, where)
-        if unit:
-            return number, self.conversion(unit, where)
-        if default is None:
-            example = example_of(number, str(value).strip(), self.quantity)
-            raise InvalidProblem(f"{value!r} has no unit", where, f"write it with a unit, such as {example}")
-        return number, default
-
-    def plain(self, value: float | str, default: str | None, where: str) -> float:
-        """Return an amount in SI units; `default` is the unit of a plain number, which None rejects."""
-        number, unit = self.amount(value, None if default is None else self.conversion(default, where), where)
-        return float(unit.to_si(number))
-
-
-Bound = Annotated[float, Field(allow_inf_nan=True)]
-"""One coordinate of a box; infinite without a bound."""
 
 Cell = str | int | float
 Row = dict[str, Cell]
@@ -125,16 +44,7 @@ _WHAT = {
 }
 
 
-class _FileTable(BaseModel):
-    """A table of the file; unknown keys are rejected."""
-
-    # Strict and closed: reject a number in quotes and a misspelt key.
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
-
-
-class Origin(_FileTable):
+class Origin(FileTable):
     """A point on Earth, WGS 84."""
 
     lat_deg: float
@@ -145,7 +55,7 @@ class Origin(_FileTable):
     """Height above the ellipsoid, metres."""
 
 
-class FrameTable(_FileTable):
+class FrameTable(FileTable):
     """The frame of computations and results."""
 
     kind: Literal["cartesian", "ecef", "enu", "geodetic"] = "cartesian"
@@ -156,7 +66,7 @@ class FrameTable(_FileTable):
     """Dimension of the positions; by default 3 if there is a z or a height."""
 
 
-class DataTable(_FileTable):
+class DataTable(FileTable):
     """Source of rows: a file, or rows in the table."""
 
     file: str | None = None
@@ -189,7 +99,7 @@ class StationsTable(DataTable):
     noise at each epoch."""
 
 
-class DeclinationTable(_FileTable):
+class DeclinationTable(FileTable):
     """The magnetic declination of the World Magnetic Model at each station."""
 
     date: str
@@ -228,6 +138,10 @@ class MeasurementsTable(DataTable):
     """Sign of differences (and sense of ratios): a minus b, or b minus a."""
     excess: bool = False
     """Whether the distance between the two stations is subtracted from a range_sum."""
+    two_way: bool = False
+    """Whether ranges are times of the way there and back."""
+    turn_around: Amount | None = None
+    """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None
@@ -279,43 +193,13 @@ class TargetTable(DataTable):
         return self.motion or ("known" if given else None)
 
 
-class ConstraintTable(_FileTable):
-    """A constraint on the position, height or velocity of targets."""
-
-    kind: Literal["box", "height", "above-ground", "polygon", "visible", "speed"]
-    """Kind of the constraint; each kind has different keys."""
-    target: str | None = None
-    """Name of the target; by default all targets."""
-    exactly: Amount | list[Bound] | None = None
-    """Known height above the WGS 84 ellipsoid; or a reported height for each epoch."""
-    within: Amount | None = None
-    """Half width of a band around `exactly`."""
-    along: bool | None = None
-    """Whether the height of a moving target holds at each epoch (default), on a course that follows the Earth, or only
-    at the reference time."""
-    min: Amount | list[Bound] | None = None
-    """Least height or speed; least coordinates of a box in the frame, -inf for no bound."""
-    max: Amount | list[Bound] | None = None
-    """Greatest height or speed; greatest coordinates of a box, inf for no bound."""
-    unit: str | None = None
-    """Unit of plain numbers; by default metres or metres per second."""
-    corners: list[list[float]] | None = None
-    """Corners [x, y] of a polygon in the plan, in order around it."""
-    corners_deg: list[list[float]] | None = None
-    """Corners [latitude, longitude] of a polygon in degrees, at the height of the origin of an ENU frame."""
-    stations: str | list[str] | None = None
-    """Stations, for instance satellites, above the horizon of the target: "all" (default), or names."""
-    elevation: Amount | None = None
-    """Least elevation of these stations, degrees; by default 0."""
-
-
 # Maximum number of depths in a table of speeds: each ray traces all of them, and a profile of the sea has a few dozen.
 _LAYERS = 1000
 # Maximum number of biases, priors and constraints, which a person writes: each step of each fix evaluates all of them.
 _MANY = 100
 
 
-class BiasTable(_FileTable):
+class BiasTable(FileTable):
     """A family of unknown systematic errors."""
 
     name: str = Field(min_length=1)
@@ -350,7 +234,7 @@ class BiasTable(_FileTable):
     times."""
 
 
-class PriorTable(_FileTable):
+class PriorTable(FileTable):
     """Prior knowledge of an unknown."""
 
     name: str
@@ -363,7 +247,7 @@ class PriorTable(_FileTable):
     """Unit of mean and sigma; by default metres, metres per second, metres per second squared."""
 
 
-class SoundTable(_FileTable):
+class SoundTable(FileTable):
     """The medium of sound waves."""
 
     medium: Literal["air", "fresh water", "sea water"]
@@ -376,7 +260,7 @@ class SoundTable(_FileTable):
     """Metres below the surface."""
 
 
-class SpeedTable(_FileTable):
+class SpeedTable(FileTable):
     """A speed with a standard deviation."""
 
     value: Amount
@@ -385,7 +269,7 @@ class SpeedTable(_FileTable):
     """Standard deviation of the speed: metres per second, or text with a unit."""
 
 
-class MediumTable(_FileTable):
+class MediumTable(FileTable):
     """A medium without a single speed; rows are then measured along rays."""
 
     kind: Literal["layers", "atmosphere"]
@@ -408,14 +292,14 @@ class MediumTable(_FileTable):
     """For an atmosphere: height in metres over which the refractivity decreases to 1 / e; by default 7350."""
 
 
-class WindowTable(_FileTable):
+class WindowTable(FileTable):
     """Assignment of rows to epochs by their times."""
 
     window: str | None = None
     """Length of an epoch, such as "0.1 s"; by default, rows of exactly equal time form an epoch."""
 
 
-class ProblemFile(_FileTable):
+class ProblemFile(FileTable):
     """A problem file."""
 
     format: Literal[1, 2]
@@ -423,9 +307,11 @@ class ProblemFile(_FileTable):
     title: str | None = None
     """Title of the problem."""
     propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | SpeedTable | None = None
-    """Metres per second, or text with a unit; or for sound: { medium = "air", celsius = 20.0 }. By default light.
-    A speed with a sigma is estimated with the target: { value = 343.0, sigma = 5.0 }.
+    """Metres per second; "343 m/s", "343+-5 m/s", "air:20C,50%", "water:8C,35,50m" or the file of a profile; or
+    { medium = "air", celsius = 20.0 }; or { value = 343.0, sigma = 5.0 }, estimated with the target. By default light.
     With layers: the speed that converted times to ranges in metres."""
+    wind: str | list[float] | None = None
+    """Velocity of the medium: "5 m/s from 270" (degrees from north), or components towards the axes, m/s."""
     medium: MediumTable | None = None
     """Layers or air, if the speed is not one number."""
     frame: FrameTable = FrameTable()

@@ -21,7 +21,7 @@ from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_se
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.roles import ColumnPlaces, Roles, placed
-from optloc.files.schema import Units
+from optloc.files.settings import Units
 from optloc.files.table import Table
 from optloc.files.table_import import (
     CARTESIAN,

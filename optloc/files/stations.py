@@ -17,7 +17,8 @@ from optloc.base.inputs import check_budget
 from optloc.base.types import Array, Stations
 from optloc.files.columns import stem
 from optloc.files.roles import WORDS, with_standard_columns
-from optloc.files.schema import FrameTable, StationsTable, Units, join
+from optloc.files.schema import FrameTable, StationsTable
+from optloc.files.settings import Units, join
 from optloc.files.table import Epochs, Table, of_frame
 from optloc.files.words import distinct
 

@@ -16,7 +16,8 @@ from optloc.base.errors import InvalidProblem, check_once, nearest
 from optloc.base.inputs import check_budget, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
 from optloc.base.units import LARGEST
-from optloc.files.schema import DataTable, join
+from optloc.files.schema import DataTable
+from optloc.files.settings import join
 from optloc.files.words import Words, distinct, objects, words_of
 
 _PARQUET = (".parquet", ".pq")

@@ -23,6 +23,7 @@ from optloc.files.cell_text import NOTHING, Decimals
 from optloc.files.columns import any_unit, is_sigma, role_of, sigma_kind, stem, tokens, unit_of, without_unit
 from optloc.files.roles import Roles
 from optloc.files.table import Table
+from optloc.files.wave_speed import WaveOptions
 from optloc.files.words import numbered
 from optloc.models import MODELS, kind_named
 
@@ -138,6 +139,10 @@ class ColumnHints:
         Lowest elevation of satellites, such as "15 deg"; by default 10 degrees.
     turned : bool
         Whether satellite positions are in the Earth axes at reception; by default at transmission.
+    wave : WaveOptions
+        Wave speed, wind, and two-way times.
+    height : str, optional
+        Known height of the target for `convert`, such as "1.2 m"; several heights are separated by commas.
     """
 
     stations: Path | None = None
@@ -164,6 +169,8 @@ class ColumnHints:
     system: str | None = None
     mask: str | None = None
     turned: bool = False
+    wave: WaveOptions = WaveOptions()
+    height: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

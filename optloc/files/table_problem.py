@@ -16,9 +16,10 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import replace_together, write_text
 from optloc.base.types import Array
 from optloc.files.cell_text import Decimals
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded, assemble
 from optloc.files.roles import ColumnPlaces
-from optloc.files.schema import ConstraintTable, document_of
+from optloc.files.schema import document_of
 from optloc.files.table import Table
 from optloc.files.words import Words
 from optloc.files.writer import write_csv
@@ -93,8 +94,9 @@ class TableProblem:
         # Use the name of the table, limited to characters that are valid on all systems.
         out = Path(f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml")
         names = [path.name for path in self.tables(out)]
-        # A stated height replaces an assumed one.
-        chosen = replace(self, height="") if "--height" in (more or {}) else self
+        # A stated height, also above a terrain, replaces an assumed one.
+        level = any(table.kind in ("height", "terrain") for table in (more or {}).values())
+        chosen = replace(self, height="") if level else self
         # As in a file, replace characters that are not valid Unicode.
         text = chosen.text(names).encode("utf-8", "replace").decode("utf-8")
         file = document_of(text, out.name)

@@ -1,12 +1,11 @@
-"""Unknowns of a problem file: motions, known targets, biases, priors, constraints.
+"""Unknowns of a problem file: motions, known targets, biases and priors.
 
-In shapes, k is the number of epochs, and d the dimension. `where` is the place for messages, and `c` is the propagation
-speed, m/s, which converts bounds that are given as times.
+In shapes, k is the number of epochs, and d the dimension. `where` is the place for messages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,27 +14,15 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
-from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity
-from optloc.files.schema import (
-    BiasTable,
-    ConstraintTable,
-    FrameTable,
-    Origin,
-    PriorTable,
-    ProblemFile,
-    StationsTable,
-    TargetTable,
-    Units,
-    join,
-)
-from optloc.files.stations import numbers_of, stations_over_epochs, survey
+from optloc.base.types import Array, Bias, Motion, Prior, Rows
+from optloc.base.units import Conversion, Quantity
+from optloc.files.schema import BiasTable, FrameTable, Origin, PriorTable, ProblemFile, StationsTable, TargetTable
+from optloc.files.settings import Units, join
+from optloc.files.stations import stations_over_epochs, survey
 from optloc.files.table import Epochs, Table, table_of
-from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
-from optloc.problem.validation import bands_by_quantity, check_polygon
 
 # Number of estimated derivatives of the position for each motion.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
@@ -49,16 +36,6 @@ _STATES: dict[str, tuple[Quantity, str]] = {
     "acceleration": ("plain", "1"),
     "emission": ("length", "m"),
 }
-# Keys of each kind of constraint, in addition to "kind" and "target".
-_KEYS = {
-    "box": ("min", "max", "unit"),
-    "height": ("exactly", "within", "min", "max", "unit", "along"),
-    "above-ground": ("along",),
-    "polygon": ("corners", "corners_deg", "unit"),
-    "visible": ("stations", "elevation"),
-    "speed": ("min", "max", "unit"),
-}
-Constraint = Band | Polygon
 
 
 def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], source: str) -> tuple[Motion, ...]:
@@ -340,233 +317,3 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
     if len(sigma) != size or (sigma <= 0.0).any():
         raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one number for each coordinate")
     return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))
-
-
-# Constraints of a problem file and of the command line.
-
-
-def constraints_of(
-    tables: Mapping[str, ConstraintTable],
-    stations: Stations,
-    frame: Frame,
-    motions: Sequence[Motion],
-    names: Sequence[str],
-    times: Array,
-    speed: float = SPEED_OF_LIGHT,
-) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
-    """Return the constraints of tables, and motions that can satisfy them.
-
-    Constraints on one quantity of one target are joined. If a height holds along a course, all moving targets follow
-    the Earth. `tables` are by their place for messages; a table without a target applies to all estimated targets.
-    `times` (k,) are the seconds of the epochs, and `speed` is the propagation speed, m/s.
-    """
-    found: list[Constraint] = []
-    motions = list(motions)
-    for where, table in tables.items():
-        _check_keys(table, where)
-        # A constraint without a target becomes one constraint for each estimated target, with its name.
-        for target in _targets(table, motions, names, where):
-            suffix = f" of {names[target]}" if len(motions) > 1 else ""
-            if table.kind in ("height", "above-ground"):
-                motions[target], made = _level(table, motions[target], times, where, speed)
-            else:
-                made = _make(table, stations, frame, where, speed)
-            found += [replace(c, target=target, name=c.name + suffix) for c in made]
-    if any(motion.over == "ground" for motion in motions):
-        motions = [replace(m, over="ground") if _moves(m) else m for m in motions]
-    return tuple(_merge(found)), tuple(motions)
-
-
-def _moves(motion: Motion) -> bool:
-    """Return whether a target has an unknown course over several epochs, with a velocity."""
-    return motion.order > 0 and motion.span == "run" and motion.known is None
-
-
-def _level(
-    table: ConstraintTable, motion: Motion, times: Array, where: str, c: float
-) -> tuple[Motion, Sequence[Constraint]]:
-    """Return the motion that can keep a height, and the constraint on the height.
-
-    A moving target with a height along its course follows the Earth.
-    """
-    if table.kind == "above-ground":
-        low, high = 0.0, np.inf
-    elif table.exactly is not None and (table.min is not None or table.max is not None):
-        raise InvalidProblem("a height is either exact or in a band", where, "give exactly, or min and max")
-    elif table.exactly is None:
-        if table.within is not None:
-            raise InvalidProblem("'within' needs 'exactly'", where, "give exactly, or min and max alone")
-        low, high = _bounds(table, "length", where, c)
-    else:
-        within = _amount(table, "within", "length", where, c) or 0.0
-        if within < 0.0:
-            raise InvalidProblem("the band has a negative width", join(where, "key 'within'"), "give the half width")
-        if isinstance(table.exactly, list):
-            return _reported(table, motion, times, within, where, c)
-        level = _amount(table, "exactly", "length", where, c)
-        assert level is not None
-        low, high = level - within, level + within
-    # bounds of a height that may curve hold at one time: inside them at both ends, the course may still leave them
-    along = table.along if table.along is not None else motion.order < 2 or low == high
-    over = replace(motion, over="ground") if along and _moves(motion) else motion
-    return over, height(low, high, along=along)
-
-
-def _reported(
-    table: ConstraintTable, motion: Motion, times: Array, within: float, where: str, c: float
-) -> tuple[Motion, Sequence[Constraint]]:
-    """Return motion and constraint for heights that are stated for each epoch.
-
-    `times` (k,) are the seconds of the epochs. `within` is the half width of the band around each height, m.
-    """
-    assert isinstance(table.exactly, list)
-    place = join(where, "key 'exactly'")
-    if motion.span == "run" and not motion.order:
-        raise InvalidProblem("a static target has one height", place, 'give one height, such as "500 m"')
-    if table.along is False:
-        raise InvalidProblem("heights of all epochs hold along the course", where, "remove along = false")
-    if len(table.exactly) != len(times):
-        what = f"{len(table.exactly)} heights for {len(times)} epochs"
-        raise InvalidProblem(what, place, "give one height for each epoch, in the order of time")
-    levels = Units("length", c).conversion(table.unit, place).factor * np.array(table.exactly, dtype=float)
-    if motion.span == "epoch":
-        # A free target has one constraint: the height minus its known rise above the first height. The rate is zero.
-        rise = np.stack([levels - levels[0], np.zeros_like(levels)], axis=-1)
-        return replace(motion, rise=rise), height(levels[0] - within, levels[0] + within)
-    return reported(levels, times, within=within, order=motion.order, reference=motion.reference)
-
-
-def _check_keys(table: ConstraintTable, where: str) -> None:
-    """Raise InvalidProblem for a key that the kind of the constraint does not use, or for a missing bound."""
-    known = _KEYS[table.kind]
-    foreign = sorted(table.model_fields_set - {"kind", "target", *known})
-    if foreign:
-        advice = nearest(foreign[0], known) if known else "remove it"
-        raise InvalidProblem(f"{table.kind} has no key {foreign[0]!r}", where, advice)
-    needed = [key for key in known if key not in {"unit", "stations", "elevation", "within", "along"}]
-    if needed and not any(getattr(table, key) is not None for key in needed):
-        raise InvalidProblem(f"{table.kind} has no bound", where, f"give {' or '.join(needed)}")
-
-
-def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[str], where: str) -> list[int]:
-    """Return the numbers of the targets that a constraint applies to; by default all targets with unknown positions.
-
-    `names` are the names of the targets.
-    """
-    if table.target is None:
-        free = [i for i, motion in enumerate(motions) if motion.known is None]
-        if not free:
-            raise InvalidProblem("the motion of each target is known", where, "remove the constraint")
-        return free
-    place = join(where, "key 'target'")
-    if table.target not in names:
-        raise InvalidProblem(
-            f"no row has the target {table.target!r}", place, nearest(table.target, sorted(set(names)))
-        )
-    if len(motions) == 1 and len(set(names)) > 1:
-        advice = "remove the key, or write one file for each target"
-        raise InvalidProblem("free targets are fixed separately, and a constraint applies to all", place, advice)
-    return [list(names).index(table.target) if len(motions) > 1 else 0]
-
-
-def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
-    """Return the constraints of a table of the kind box, speed, polygon or visible."""
-    if table.kind == "box":
-        low, high = (_corner(table, key, stations.dimension, where, c) for key in ("min", "max"))
-        return box(low.tolist(), high.tolist())
-    if table.kind == "speed":
-        least, most = _bounds(table, "speed", where, c)
-        return speed(most, lower=least)
-    return _region(table, frame, where, c) if table.kind == "polygon" else _visibility(table, stations, frame, where)
-
-
-def _bounds(table: ConstraintTable, quantity: Quantity, where: str, c: float) -> tuple[float, float]:
-    """Return the least and the greatest value of a constraint, SI; infinite without a bound."""
-    low, high = (_amount(table, key, quantity, where, c) for key in ("min", "max"))
-    return -np.inf if low is None else low, np.inf if high is None else high
-
-
-def _amount(table: ConstraintTable, key: str, quantity: Quantity, where: str, c: float) -> float | None:
-    """Return the bound under a key, SI; None without the key. Raise InvalidProblem for a list."""
-    value: Amount | list[float] | None = getattr(table, key)
-    place = join(where, f"key {key!r}")
-    if isinstance(value, list):
-        raise InvalidProblem(f"{table.kind} has one bound, not a list", place, 'give one bound, such as "500 m"')
-    units = Units(quantity, c)
-    return None if value is None else units.plain(value, units.name(table.unit), place)
-
-
-def _corner(table: ConstraintTable, key: str, dimension: int, where: str, c: float) -> Array:
-    """Return the least or greatest coordinates (d,) of a box; infinite without a bound."""
-    value = getattr(table, key)
-    if value is None:
-        return np.full(dimension, -np.inf if key == "min" else np.inf)
-    place = join(where, f"key {key!r}")
-    if not isinstance(value, list) or len(value) != dimension:
-        count = f"{len(value)} coordinates" if isinstance(value, list) else "one number"
-        raise InvalidProblem(
-            f"the box has {count}, not {dimension}",
-            place,
-            "give one number for each coordinate; inf or -inf means no bound",
-        )
-    return Units("length", c).conversion(table.unit, place).factor * np.array(value)
-
-
-def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
-    """Return the constraint to a polygon in the plan, with corners in x and y, or in latitude and longitude."""
-    key = "corners" if table.corners is not None else "corners_deg"
-    place = join(where, f"key {key!r}")
-    if table.corners is not None and table.corners_deg is not None:
-        raise InvalidProblem("the corners are given twice", where, "give corners or corners_deg")
-    given = table.corners if table.corners is not None else table.corners_deg
-    assert given is not None
-    bad = next((i for i, corner in enumerate(given) if len(corner) != 2), None)
-    if bad is not None:
-        raise InvalidProblem(f"corner {bad + 1} has {len(given[bad])} coordinates", place, "give two coordinates")
-    corners = np.array(given, dtype=float).reshape(-1, 2)
-    if table.corners_deg is None:
-        corners = Units("length", c).conversion(table.unit, place).factor * corners
-    elif frame.kind != "enu":
-        advice = 'write kind = "enu" in [frame]'
-        raise InvalidProblem("corners in latitude and longitude need an enu frame", place, advice)
-    else:
-        assert frame.origin is not None
-        lat, lon = np.radians(corners).T
-        # Use the height of the origin: a point above the ground has other x and y in the plan.
-        level = np.full(len(corners), frame.origin[2])
-        corners = frame.from_geodetic(lat, lon, level, where=place, first_row=1)[:, :2]
-    check_polygon(corners, place)
-    return polygon(corners)
-
-
-def _visibility(table: ConstraintTable, stations: Stations, frame: Frame, where: str) -> Sequence[Constraint]:
-    """Return one constraint for each named station: the station is above the horizon of the target."""
-    if not frame.geodetic or stations.dimension != 3:
-        raise InvalidProblem("a horizon needs a geodetic frame", where, "use frame ecef or enu with 3-D stations")
-    if stations.position.shape[-3] > 1:
-        raise InvalidProblem(
-            "the stations move, so their horizon is not constant", where, "give one file for each epoch"
-        )
-    chosen = stations.names if table.stations is None or table.stations == "all" else table.stations
-    place = join(where, "key 'stations'")
-    if isinstance(chosen, str):
-        raise InvalidProblem(f"{chosen!r} is not a list of stations", place, 'give "all" or a list of names')
-    if not chosen:
-        raise InvalidProblem("no station is named", place, nearest("", stations.names))
-    index = numbers_of(chosen, stations.names, place)
-    place = join(where, "key 'elevation'")
-    elevation = Units("angle").plain(0.0 if table.elevation is None else table.elevation, "deg", place)
-    if abs(elevation) > np.pi / 2:
-        raise InvalidProblem("the elevation is outside -90 to 90 deg", place, "give degrees above the horizon")
-    seen = visible(frame.to_ecef(stations.position[0, index]), elevation=elevation)
-    return [replace(band, name=f"sight of {name}") for band, name in zip(seen, chosen, strict=True)]
-
-
-def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
-    """Yield the intersection of the bands on each quantity, and each polygon once."""
-    # Keep two bands that contradict each other: the check of the problem reports them.
-    for bands in bands_by_quantity(constraints):
-        lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
-        if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
-            yield replace(bands[0], lower=lower, upper=upper)
-    yield from {(c.target, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.linalg import tangent
-from optloc.base.types import Array, Band, Polygon
+from optloc.base.types import Array, Band, Constraint
 from optloc.linear.constraints import Face, exact, levels, restore, tangent_at
 from optloc.linear.normal import Normal, marginal, step
 from optloc.linear.redundancy import degrees_of_freedom
@@ -163,9 +163,9 @@ def spare_rows(problem: Problem) -> Array:
     return np.asarray(found + own * (observed.sum(1) - 1))
 
 
-def _spread(band: Band | Polygon, shape: tuple[int, int]) -> Band | Polygon:
+def _spread(band: Constraint, shape: tuple[int, int]) -> Constraint:
     """Return an equality whose bounds and coefficients have one axis (M k,), for M problems with k epochs each."""
-    if isinstance(band, Polygon):
+    if not isinstance(band, Band):  # only bands are equalities
         return band
     lower, upper = (b if b.ndim == 0 else np.broadcast_to(b, shape).ravel() for b in (band.lower, band.upper))
     c = band.coefficients

@@ -100,7 +100,8 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
         used += count + 2
         unit = length if surface.unit == "m" else 1.0
         for epoch in decisive_epochs(problem, band):
-            value = bounded(problem, band, _states(problem, band.target, x), c, epoch)
+            others = None if band.other is None else _states(problem, band.other, x)
+            value = bounded(problem, band, _states(problem, band.target, x), c, epoch, others)
             # Whether a side exists is part of the structure; its value is a parameter.
             if np.all(band.lower == band.upper):
                 equal.append((value - lower) / unit)

@@ -189,6 +189,8 @@ def _equality_excludes_image(problem: Problem, shape: _Shape) -> bool:
                 return True
         if band.kind == "height" and abs(float(problem.frame.enu_axes(shape.centre)[2] @ normal)) > _ACROSS:
             return True
+        if band.kind == "terrain" and abs(float(normal[2])) > _ACROSS:
+            return True
     return False
 
 

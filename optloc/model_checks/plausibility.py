@@ -1,7 +1,7 @@
 """Physical checks of a problem before it is solved: negative ranges, wrong units, wrapped counters, slant ranges.
 
-`refuse_impossible` raises for values that no position can have. `suspicious_values` returns sentences about values that are
-suspicious, and never changes a value. All readers use the same table of checks, `CHECKS`.
+`refuse_impossible` raises for values that no position can have. `suspicious_values` returns sentences about suspicious
+values, and never changes a value. All readers use the same table of checks, `CHECKS`.
 
 In shapes, n is the number of rows of one group, and d the dimension. A group has the rows of one kind in one epoch.
 """

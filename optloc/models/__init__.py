@@ -20,7 +20,7 @@ from typing import Any
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Registry
 from optloc.base.units import UNITS
-from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, arrival, path, path_rate
+from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, Wind as Wind, arrival, path, path_rate
 from optloc.models.primitives import (
     Components,
     Point,
@@ -317,7 +317,6 @@ _KINDS: dict[str, Model] = {
         lifted=_lifted_elevation,
         period=tau,
         axes=True,
-        dimensions=(3,),
         ray=lambda t, a, b: _elevation(arrival(t, a)),
         aliases=("elevation_angle",),
     ),
@@ -328,7 +327,6 @@ _KINDS: dict[str, Model] = {
         "height above the WGS 84 ellipsoid",
         nodes=((1.0, "height"),),
         ecef=True,
-        dimensions=(3,),
         aliases=("altitude",),
     ),
     "range_rate": Model(
@@ -391,7 +389,6 @@ def _along_rays(name: str) -> Model:
         lifted=None,
         ray=None,
         straight=kind,
-        dimensions=(3,),
         aliases=(),
     )
 

@@ -20,6 +20,7 @@ from optloc.models.primitives import (
     subtract,
     within,
 )
+from optloc.models.wind import Wind
 
 # Mean radius of the Earth, metres. The layers of air are concentric with it. The curvature of the ellipsoid differs by
 # half a percent, which is 0.2 m for a path of 400 km.
@@ -124,8 +125,8 @@ class Atmosphere:
         return total[0], length, (total[1], total[2], total[3])
 
 
-Medium = Layers | Atmosphere
-__all__ = ["Atmosphere", "Layers", "Medium", "arrival", "path", "path_rate"]
+Medium = Layers | Atmosphere | Wind
+__all__ = ["Atmosphere", "Layers", "Medium", "Wind", "arrival", "path", "path_rate"]
 
 
 def path(t: Point, a: Point) -> Any:

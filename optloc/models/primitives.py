@@ -67,6 +67,12 @@ class Point:
         Unit normal of the ellipsoid at the position, in the problem's frame.
     medium : Layers or Atmosphere, optional
         Medium of the waves (`optloc.models.medium`).
+    acceleration : tuple of d numbers, optional
+        Metres per second squared.
+    span : tuple of 2 float, optional
+        First and last time of the run, seconds after the time of the position and the velocity.
+    other : Point, optional
+        Another target, for quantities of two targets.
     """
 
     position: Components
@@ -75,6 +81,9 @@ class Point:
     ecef: Components | None = None
     up: Components | None = None
     medium: Any = None
+    acceleration: Components | None = None
+    span: tuple[float, float] | None = None
+    other: Point | None = None
 
 
 def dot(u: Components, v: Components) -> Any:
@@ -333,6 +342,20 @@ def atan2(u: Any, v: Any) -> Jet:
     (p, du), (q, dv) = _parts(u), _parts(v)
     squared = p * p + q * q
     return Jet(namespace(p).atan2(p, q), _sum(_scale(du, q / squared), _scale(dv, -p / squared)))
+
+
+def clip(u: Any, low: float, high: float) -> Any:
+    """Return u limited to the interval from `low` to `high`: a Jet, a number, an array or a CasADi symbol.
+
+    Outside the interval the derivative is zero.
+    """
+    if isinstance(u, Jet):
+        inside = (u.value >= low) & (u.value <= high)
+        return Jet(clip(u.value, low, high), _scale(u.partials, 1.0 * inside))
+    xp = namespace(u)
+    if getattr(xp, "__name__", "") == "casadi":
+        return xp.fmin(xp.fmax(u, low), high)
+    return xp.clip(u, low, high)
 
 
 def differential(value: Any, parts: Sequence[tuple[Any, Any]]) -> Any:

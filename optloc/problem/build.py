@@ -17,7 +17,7 @@ from optloc.base.arrays import as_deviations, as_integers, numbers
 from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Amount, Amounts, Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations, Whole
+from optloc.base.types import Amount, Amounts, Array, Bias, Constraint, Motion, Prior, Rows, Stations, Whole
 from optloc.base.units import Quantity, in_si
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
@@ -257,7 +257,7 @@ def assemble(
     priors: Sequence[Prior] = (),
     frame: Frame = CARTESIAN,
     covariance: ArrayLike | None = None,
-    constraints: Sequence[Band | Polygon | Sequence[Band | Polygon]] = (),
+    constraints: Sequence[Constraint | Sequence[Constraint]] = (),
     medium: Medium | None = None,
 ) -> Problem:
     """Return a problem, or a batch of problems if the arrays have leading axes.
@@ -280,7 +280,7 @@ def assemble(
         Coordinate frame.
     covariance : array (..., m, m), optional
         Joint covariance of all rows, across kinds. It replaces the noise of the measurements.
-    constraints : sequence of Band, Polygon or tuples of them
+    constraints : sequence of Band, Polygon, AnyOf or tuples of them
         Conditions that the answer must meet, see `optloc.linear.constraints`.
     medium : Layers or Atmosphere, optional
         Medium of the waves if their speed is not constant. Rows are then measured along rays of the medium.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Rows, Stations
+from optloc.base.types import AnyOf, Array, Bias, Constraint, Motion, Polygon, Rows, Stations
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
 
@@ -141,10 +141,13 @@ def states_by_epoch(problem: Problem) -> Problem:
     )
 
 
-def _spread_constraint(c: Band | Polygon, rise: Array | None) -> Band | Polygon:
+def _spread_constraint(c: Constraint, rise: Array | None) -> Constraint:
     """Return a constraint for each epoch; `rise` (..., k, 2) is the known change of height, m, and its rate, m/s."""
     if isinstance(c, Polygon):
         return c
+    if isinstance(c, AnyOf):
+        spread = [tuple(_spread_constraint(band, rise) for band in member) for member in c.members]
+        return replace(c, members=tuple(spread))  # type: ignore[arg-type]  # bands stay bands
     rise_of_height = 0.0 if rise is None or not c.along else rise[..., 0]
     lower, upper = (_add_epoch_axis(bound, 0) + rise_of_height for bound in (c.lower, c.upper))
     return replace(c, lower=lower, upper=upper, coefficients=_add_epoch_axis(c.coefficients, 1))

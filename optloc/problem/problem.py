@@ -15,10 +15,10 @@ import numpy as np
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Array, Band, Bias, CompassRows, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import AnyOf, Array, Band, Bias, CompassRows, Constraint, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
-from optloc.models.medium import Atmosphere, Medium
+from optloc.models.medium import Atmosphere, Medium, Wind
 from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
@@ -46,7 +46,7 @@ class Problem:
         Gaussian prior knowledge of named unknowns.
     frame : Frame
         Coordinate frame.
-    constraints : tuple of Band or Polygon
+    constraints : tuple of Band, Polygon or AnyOf
         Conditions that the answer must meet.
     medium : Layers or Atmosphere, optional
         Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
@@ -60,7 +60,7 @@ class Problem:
     biases: tuple[Bias, ...] = ()
     priors: tuple[Prior, ...] = ()
     frame: Frame = CARTESIAN
-    constraints: tuple[Band | Polygon, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
     medium: Medium | None = None
 
     @property
@@ -167,8 +167,7 @@ class Problem:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons are not part of the key: cached programs depend on the bands of their edges, which their keys
         # contain.
-        bands = [c for c in self.constraints if isinstance(c, Band)]
-        constraints = tuple((c.kind, c.target, *_band_key(c, self.motions[c.target])) for c in bands)
+        constraints = tuple(_constraint_key(c, self.motions) for c in self.constraints if not isinstance(c, Polygon))
         medium = () if self.medium is None else (self.medium,)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
 
@@ -263,6 +262,9 @@ def check_medium(problem: Problem) -> None:
     medium, frame = problem.medium, problem.frame.kind
     if medium is None:
         return
+    if isinstance(medium, Wind):
+        _check_wind(problem, medium)
+        return
     if problem.dimension != 3:
         raise InvalidProblem("a medium needs three dimensions, and the stations have two", "medium", "give z or height")
     if isinstance(medium, Atmosphere):
@@ -282,6 +284,18 @@ def check_medium(problem: Problem) -> None:
         raise InvalidProblem(what, "stations", "widen the table of speeds, or check the sign of z")
 
 
+def _check_wind(problem: Problem, wind: Wind) -> None:
+    """Raise if the axes of a wind differ from the axes of the frame, or for rows in which the wave goes both ways."""
+    if len(wind.velocity) > problem.dimension:
+        raise InvalidProblem("the wind has three components, and the stations have two", "wind", "leave out the third")
+    if problem.frame.kind == "ecef" and len(wind.velocity) < problem.dimension:
+        advice = 'give three components, or use the frame "enu" with an origin'
+        raise InvalidProblem("the axes of the frame are not east and north", "wind", advice)
+    sums = next((rows.kind for rows in problem.rows if rows.kind.endswith("range_sum")), None)
+    if sums is not None:
+        raise InvalidProblem("a range sum has no single direction through the wind", "wind", "remove the wind")
+
+
 # Parts of a structure that few problems have. Problems without them keep the keys of stored simulations.
 
 
@@ -290,9 +304,21 @@ def _motion_key(motion: Motion) -> tuple[Any, ...]:
     return () if motion.over == "space" and motion.rise is None else (motion.over, motion.rise is None)
 
 
-def _band_key(band: Band, motion: Motion) -> tuple[str, ...]:
-    """Return the part of a key that marks a band along a course that is unknown; () otherwise."""
-    return ("along",) if band.along and motion.order and motion.span == "run" else ()
+def _constraint_key(constraint: Band | AnyOf, motions: tuple[Motion, ...]) -> tuple[Any, ...]:
+    """Return the part of a key that describes a constraint without its numbers."""
+    if isinstance(constraint, AnyOf):
+        members = tuple(tuple(_constraint_key(band, motions) for band in member) for member in constraint.members)
+        return ("any of", constraint.target, members)
+    return (constraint.kind, constraint.target, *_band_key(constraint, motions))
+
+
+def _band_key(band: Band, motions: tuple[Motion, ...]) -> tuple[Any, ...]:
+    """Return the parts of a key for a band along an unknown course, of two targets, or with a table; () otherwise."""
+    motion = motions[band.target]
+    along = ("along",) if band.along and motion.order and motion.span == "run" else ()
+    other = () if band.other is None else ("other", band.other)
+    # programs contain the numbers of a table
+    return (*along, *other, *(() if band.table is None else ("table", band.table.digest)))
 
 
 def _bias_key(bias: Bias) -> tuple[Any, ...]:
@@ -327,6 +353,13 @@ _NUMBERS: dict[type, dict[str, int]] = {
 }
 
 
+def _parts(constraint: Constraint) -> tuple[Band | Polygon, ...]:
+    """Return the parts of a constraint that have numeric arrays: itself, or the bands of a union."""
+    if isinstance(constraint, AnyOf):
+        return tuple(band for member in constraint.members for band in member)
+    return (constraint,)
+
+
 def _numbers(part: Any) -> list[tuple[str, Array, int]]:
     """Return name, array and rank without batch axes of each numeric array of a part of a problem."""
     arrays = [(name, getattr(part, name), core) for name, core in _NUMBERS[type(part)].items()]
@@ -336,7 +369,8 @@ def _numbers(part: Any) -> list[tuple[str, Array, int]]:
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     """Return each numeric array of a problem, with its rank without batch axes."""
     blocks = problem.noise.blocks
-    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *problem.constraints)
+    limits = tuple(part for constraint in problem.constraints for part in _parts(constraint))
+    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *limits)
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
@@ -347,6 +381,8 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
     """
 
     def changed(part: Any) -> Any:
+        if isinstance(part, AnyOf):
+            return replace(part, members=tuple(each(member) for member in part.members))
         arrays = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
         numbers = {name: new for name, old, new in arrays if new is not old}
         return replace(part, **numbers) if numbers else part

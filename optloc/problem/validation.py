@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, check_once, nearest
+from optloc.base.errors import InvalidProblem, check_once
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
 from optloc.base.units import LARGEST
 from optloc.models import MODELS
-from optloc.models.surfaces import SURFACES
-from optloc.problem.epochs import has_correlated_epochs, separable, without_epoch_correlation
+from optloc.problem.constraint_checks import check_constraints, out_of_range
+from optloc.problem.epochs import has_correlated_epochs, without_epoch_correlation
 from optloc.problem.forms import form_of
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem, at_rest, check_medium
@@ -74,17 +74,10 @@ def _cut_noise(problem: Problem) -> Problem:
     return problem
 
 
-def _out_of_range(values: Any) -> tuple[Any, str]:
-    """Return a mask of values that are not finite or whose squares overflow, and words for the first such value."""
-    values = np.asarray(values)
-    bad = ~(np.abs(values) <= LARGEST)
-    return bad, "not finite" if not np.isfinite(values[bad]).all() else f"beyond {LARGEST:g}"
-
-
 def _check_stations(problem: Problem) -> None:
     """Raise if positions, names or error covariances of the stations are invalid."""
     stations: Stations = problem.stations
-    bad, why = _out_of_range(stations.position)
+    bad, why = out_of_range(stations.position)
     if bad.any():
         name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
         raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
@@ -124,7 +117,7 @@ def _check_moving(problem: Problem) -> None:
         if array.shape[-core] not in (1, problem.epochs):
             counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
             raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
-        bad, why = _out_of_range(array)
+        bad, why = out_of_range(array)
         if bad.any():
             label = s.names[int(np.argwhere(bad.any(tuple(range(-core + 2, 0))))[0][-1])]
             raise InvalidProblem(f"the {name} of station {label!r} is {why}", "stations", "give SI units")
@@ -184,7 +177,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
     check_values(rows)
-    bad, why = _out_of_range(rows.correction)
+    bad, why = out_of_range(rows.correction)
     if bad.any():
         raise InvalidProblem(f"{rows.kind} has a correction that is {why}", "correction", "give 0 where none is known")
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
@@ -242,7 +235,7 @@ def _check_covariance(covariance: Array, place: str, names: Sequence[str] | Arra
 def _check_times(problem: Problem) -> None:
     """Raise unless the times of the epochs are finite and increase."""
     times = problem.times
-    if times.ndim != 1 or _out_of_range(times)[0].any():
+    if times.ndim != 1 or out_of_range(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
         epoch = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
@@ -287,7 +280,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(f"the motion has order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
-    if motion.reference is not None and _out_of_range(motion.reference)[0]:
+    if motion.reference is not None and out_of_range(motion.reference)[0]:
         raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
     _check_course_over(problem, motion, where)
     if motion.known is None:
@@ -302,7 +295,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(
             f"known states are for {shape[-3]} epochs, not {counts}", where, "give one, or one for each"
         )
-    bad, why = _out_of_range(motion.known)
+    bad, why = out_of_range(motion.known)
     if bad.any():
         raise InvalidProblem(f"a known state is {why}", where, "give metres and metres per second")
     if shape[-3] > 1 and shape[-2] == 1:
@@ -333,7 +326,7 @@ def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
     if motion.rise.shape[-2:] != (problem.epochs, 2):
         what = f"a rise of shape {motion.rise.shape} for {problem.epochs} epochs"
         raise InvalidProblem(what, where, "give height and rate at each epoch, see optloc.constraints.reported")
-    bad, why = _out_of_range(motion.rise)
+    bad, why = out_of_range(motion.rise)
     if bad.any():
         raise InvalidProblem(f"a rise is {why}", where, "give metres and metres per second")
 
@@ -350,7 +343,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
         bad = (index < 0) | (index >= limit)
         if bad.any():
             raise InvalidProblem(f"there is no {name} {index[bad][0]}", where, f"use 0 to {limit - 1}")
-    bad, why = _out_of_range(bias.coefficient)
+    bad, why = out_of_range(bias.coefficient)
     if bad.any():
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
     if form.enters == "turns":
@@ -368,7 +361,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
                 f"{name} has {np.size(values)} entries, not {wanted}", where, "give one for each unknown"
             )
     sigma = np.asarray(bias.sigma)
-    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _out_of_range(bias.mean)[0].any():
+    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or out_of_range(bias.mean)[0].any():
         raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
 
 
@@ -421,180 +414,6 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
             where,
             f"give {slot.size} entries",
         )
-    bad, why = _out_of_range(prior.mean)
+    bad, why = out_of_range(prior.mean)
     if bad.any():
         raise InvalidProblem(f"the mean is {why}", where, "give SI units, or no prior")
-
-
-# Limit of corners, because the checks compare each edge with every other edge, and each edge is a piece of the region.
-_CORNERS = 1000
-
-# Checks of constraints: malformed or contradictory constraints raise an error that names them.
-
-# Lengths relative to the size of the polygon, and areas relative to its square, below which corners and edges touch:
-# four digits above rounding error.
-_SLIVER = 1e-12
-
-
-def check_constraints(problem: Problem) -> None:
-    """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status."""
-    for constraint in problem.constraints:
-        where = f"constraint {constraint.name!r}"
-        _check_target(problem, constraint, where)
-        if isinstance(constraint, Polygon):
-            _check_plan(problem, where)
-            check_polygon(constraint.vertices, where)
-        else:
-            _check_band(problem, constraint, where)
-    for same in bands_by_quantity(problem.constraints):
-        _check_agreement(same)
-
-
-def bands_by_quantity(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
-    """Return groups of bands on the same quantity of the same target, in the order of their first members."""
-    groups: dict[tuple[str, int, bool, bytes], list[Band]] = {}
-    for c in constraints:
-        if isinstance(c, Band):
-            key = (c.kind, c.target, c.along, np.asarray(c.coefficients, dtype=float).tobytes())
-            groups.setdefault(key, []).append(c)
-    return list(groups.values())
-
-
-def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> None:
-    """Raise if the target of a constraint is missing or known, or if other unknowns connect its free epochs."""
-    count = len(problem.motions)
-    if not 0 <= constraint.target < count:
-        raise InvalidProblem(f"there is no target {constraint.target}", where, f"use 0 to {count - 1}")
-    motion = problem.motions[constraint.target]
-    if motion.known is not None:
-        raise InvalidProblem("the target's motion is known", where, "leave the constraint out")
-    if motion.span == "epoch" and problem.epochs > 1 and not separable(problem):
-        advice = "let the target be static or move uniformly, or leave out the unknowns that epochs share"
-        raise InvalidProblem("other unknowns connect the epochs of this free target", where, advice)
-
-
-def _check_plan(problem: Problem, where: str) -> None:
-    """Raise if the frame has no horizontal plan, which a polygon needs."""
-    if problem.frame.kind == "ecef":
-        advice = "use the frame enu, whose first two coordinates are east and north"
-        raise InvalidProblem("a polygon needs a plan, and the frame is ECEF", where, advice)
-
-
-def check_polygon(vertices: Array, where: str) -> None:
-    """Raise if corners (v, 2) do not form a simple polygon."""
-    if vertices.ndim != 2 or vertices.shape[-1] != 2 or len(vertices) < 3:
-        count = "no pairs" if vertices.ndim != 2 or vertices.shape[-1] != 2 else f"only {len(vertices)} corners"
-        raise InvalidProblem(f"the polygon has {count}", where, "give three corners or more, two coordinates each")
-    if len(vertices) > _CORNERS:
-        what = f"the polygon has {len(vertices)} corners, {_CORNERS} at most"
-        raise InvalidProblem(what, where, "leave out corners that change the shape little")
-    bad, why = _out_of_range(vertices)
-    if bad.any():
-        corner = int(np.flatnonzero(bad.any(-1))[0])
-        raise InvalidProblem(f"corner {corner + 1} is {why}", where, "give two numbers")
-    # Relative to the mean, because corners in metres from a distant origin would lose the digits that areas need.
-    v = vertices - vertices.mean(0)
-    size = np.abs(v).max()
-    i, j = np.triu_indices(len(v), 1)
-    twice = np.flatnonzero((np.abs(v[i] - v[j]) <= _SLIVER * size).all(-1))
-    if len(twice):
-        one, two = int(i[twice[0]]) + 1, int(j[twice[0]]) + 1
-        advice = "leave one out; the last corner connects to the first automatically"
-        raise InvalidProblem(f"corner {two} repeats corner {one}", where, advice)
-    if abs(_cross(v, np.roll(v, -1, axis=0)).sum()) <= _SLIVER * size**2:
-        raise InvalidProblem("the polygon has no area", where, "give corners in order around the region")
-    crossing = _crossing(v, size)
-    if crossing is not None:
-        edges = " and ".join(f"{e + 1}-{(e + 1) % len(v) + 1}" for e in crossing)
-        raise InvalidProblem(f"the polygon is not simple: its edges {edges} meet", where, "give corners in order")
-
-
-def _crossing(v: Array, size: float) -> tuple[int, int] | None:
-    """Return the numbers of two edges of a polygon that meet elsewhere than at a common corner, or None.
-
-    `v` (n, 2) are the corners, and `size` is the size of the polygon, both in metres.
-    """
-    a, b, n = v, np.roll(v, -1, axis=0), len(v)
-    i, j = np.triu_indices(n, 1)
-    # Pairs of edges without a common corner. The last edge is a neighbour of the first.
-    apart = (j - i > 1) & (j - i < n - 1)
-    along = b - a
-    # Two segments meet if the ends of each are on different sides of the other, or on it. For collinear segments the
-    # bounding boxes decide.
-    straddle = np.ones(len(i), dtype=bool)
-    for p, q in ((i, j), (j, i)):
-        sides = _cross(along[p], a[q] - a[p]), _cross(along[p], b[q] - a[p])
-        straddle &= np.sign(_rounded(sides[0], size)) * np.sign(_rounded(sides[1], size)) <= 0
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    overlap = ((low[i] <= high[j]) & (low[j] <= high[i])).all(-1)
-    # Neighbours always meet at their corner. They overlap only if one turns straight back.
-    turns_back = (np.abs(_cross(along[i], along[j])) <= _SLIVER * size**2) & ((along[i] * along[j]).sum(-1) < 0.0)
-    bad = np.flatnonzero(np.where(apart, straddle & overlap, turns_back & ((j - i == 1) | (j - i == n - 1))))
-    return (int(i[bad[0]]), int(j[bad[0]])) if len(bad) else None
-
-
-def _rounded(area: Array, size: float) -> Array:
-    """Return signed areas (...), m^2, zero if within rounding error for a polygon of this `size`, m."""
-    return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product (...) of plane vectors (..., 2): twice a signed area."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-
-
-def _check_band(problem: Problem, band: Band, where: str) -> None:
-    """Raise if the kind, coefficients or bounds of a band are invalid."""
-    surface = SURFACES.get(band.kind)
-    if surface is None:
-        raise InvalidProblem(f"unknown quantity {band.kind!r}", where, nearest(band.kind, SURFACES))
-    if surface.ecef and not problem.frame.geodetic:
-        raise InvalidProblem(f"{band.kind} needs a geodetic frame", where, "use frame ecef or enu with an origin")
-    if surface.ecef and problem.dimension != 3:
-        raise InvalidProblem(f"{band.kind} needs three dimensions", where, "use 3-D stations")
-    if surface.velocity and problem.motions[band.target].order == 0:
-        raise InvalidProblem(f"{band.kind} needs a target that moves", where, "give it a velocity, or leave this out")
-    motion = problem.motions[band.target]
-    if band.along and motion.span == "run" and motion.order > 0:
-        _check_along(motion, band, where)
-    size = problem.dimension if surface.coefficients < 0 else surface.coefficients
-    given = np.shape(band.coefficients)[-1:]
-    if given != (size,):
-        raise InvalidProblem(f"coefficients of shape {np.shape(band.coefficients)}", where, f"give {size} numbers")
-    bad, why = _out_of_range(band.coefficients)
-    if np.any(bad):
-        raise InvalidProblem(f"a coefficient is {why}", where, "give numbers")
-    for name, bound, absent in (("lower", band.lower, -np.inf), ("upper", band.upper, np.inf)):
-        bad = _out_of_range(bound)[0] & (np.asarray(bound) != absent)
-        if np.any(bad):
-            raise InvalidProblem(
-                f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"
-            )
-
-
-def _check_along(motion: Motion, band: Band, where: str) -> None:
-    """Raise if a band cannot apply at all times of this motion."""
-    other = "or apply it at the reference time only, with along=False"
-    if (band.kind, motion.over) not in (("height", "ground"), ("plane", "space")):
-        what, advice = f"{band.kind} cannot apply along a course over {motion.over}", f"use the other course, {other}"
-        if band.kind == "height":
-            what, advice = "a straight course has no constant height above the Earth", f"give over='ground', {other}"
-        raise InvalidProblem(what, where, advice)
-    if motion.order > 1 and not np.all(band.lower == band.upper):
-        raise InvalidProblem("bounds along a course of constant acceleration", where, f"give one exact value, {other}")
-
-
-def _check_agreement(bands: Sequence[Band]) -> None:
-    """Raise if bands on one quantity contradict each other, or if the same equality is given twice."""
-    where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit.replace("1", "")
-    exact = [band.lower for band in bands if np.all(band.lower == band.upper)]
-    # All bands on one quantity apply: compare the highest lower bound with the lowest upper bound.
-    low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
-    high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
-    clash = np.broadcast_arrays(low, high, low > high)  # the third array marks contradictions
-    if clash[2].any():
-        least, most = (f"{np.ravel(bound[clash[2]])[0]:.10g} {unit}".strip() for bound in clash[:2])
-        what = f"it must be at least {least} and at most {most}"
-        raise InvalidProblem(what, where, "correct the bounds, they contradict each other")
-    if len(exact) > 1:
-        raise InvalidProblem("the same equality is given twice", where, "leave one of them out")

@@ -18,9 +18,11 @@ from optloc.files import (
     FREE,
     Draft,
     ProblemFile,
+    StatedConstraint,
     Table,
     assemble,
     join,
+    limits_of,
     name_of,
     places_of,
     read_document,
@@ -148,6 +150,8 @@ class Site:
         Rows of each ``[[measurements]]``.
     places : mapping of str to Table
         Positions of known targets.
+    limits : mapping of str to StatedConstraint
+        Constraints with the contents of their files, by their place for messages.
     rows : tuple of SiteRow
         Template of an event, in the order of the file.
     stations : tuple of str
@@ -176,6 +180,7 @@ class Site:
     station_table: Table
     tables: tuple[Table, ...]
     places: dict[str | None, Table]
+    limits: dict[str, StatedConstraint]
     rows: tuple[SiteRow, ...]
     stations: tuple[str, ...]
     position: Array
@@ -308,7 +313,9 @@ class Site:
             tables.append(_table(table, section.kind is None, chosen, [k >= 0 for k in place]))
             order.append(place)
         file = self.file.model_copy(update={"measurements": sections})
-        draft = assemble(file, self.station_table, tables, self.source, values=False, known=self.places)
+        draft = assemble(
+            file, self.station_table, tables, self.source, values=False, known=self.places, limits=self.limits
+        )
         return draft, order
 
 
@@ -368,12 +375,12 @@ def read_site(path: Path, method: str = "auto") -> Site:
     """
     file, source = read_document(path), name_of(path)
     station_table = table_of(file.stations, path.parent, join(source, "[stations]"))
-    places = places_of(file, path.parent, source)
+    places, limits = places_of(file, path.parent, source), limits_of(file, path.parent, source)
     tables = [
         table_of(section, path.parent, join(source, f"[[measurements]] {i + 1}"))
         for i, section in enumerate(file.measurements)
     ]
-    draft = assemble(file, station_table, tables, source, values=False, known=places)
+    draft = assemble(file, station_table, tables, source, values=False, known=places, limits=limits)
     _check(draft, source)
     rows = _template(draft, source)
     problem = draft.loaded.problem
@@ -383,7 +390,7 @@ def read_site(path: Path, method: str = "auto") -> Site:
     number = {name: i for i, name in enumerate(problem.stations.names)}
     hearing = {number[end] for i in arriving for end in (rows[i].a, rows[i].b) if end}
     site = Site(
-        source, draft.loaded.title, method, draft.file, station_table, draft.tables, places, rows,
+        source, draft.loaded.title, method, draft.file, station_table, draft.tables, places, limits, rows,
         problem.stations.names, problem.stations.position[0], problem.frame, speed_of(file, source), arriving,
         tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
         {row[2:5]: i for i, row in enumerate(rows)}, number,

@@ -18,10 +18,11 @@ from optloc.base import linalg
 from optloc.base.types import Array, Band, Status
 from optloc.kernels.least_squares import Limits, Refined, refine
 from optloc.kernels.sums import equations_at
-from optloc.linear.constraints import Face, Level, exact, levels
+from optloc.linear.constraints import Face, Level, band_at, exact, levels
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, marginal
 from optloc.models.layers import Layers
+from optloc.models.surfaces import SURFACES
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import equal_cost
 
@@ -82,11 +83,14 @@ def strata_of(problem: Problem, face: Face = ()) -> Strata | None:
 
 
 def _holds_depth(problem: Problem, level: Level) -> bool:
-    """Return whether the constraint of a level determines the third coordinate: a height, or a plane with a z term."""
-    band = problem.constraints[level.constraint]
-    if not isinstance(band, Band):
-        return False
-    return band.kind == "height" or (band.kind == "plane" and bool(np.any(band.coefficients[..., 2] != 0.0)))
+    """Return whether the constraint of a level restricts the third coordinate: a height, or a plane with a z term."""
+    band = band_at(problem, level)
+    if band.kind == "plane":
+        return bool(np.any(band.coefficients[..., 2:] != 0.0))
+    # distances in the plan have two or four coefficients
+    return SURFACES[band.kind].places and not (
+        band.kind in ("distance", "segment") and band.coefficients.shape[-1] in (2, 4)
+    )
 
 
 def in_every_layer(strata: Strata, x: Array) -> Array:

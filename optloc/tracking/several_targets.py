@@ -14,6 +14,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion, Rows, Status
+from optloc.linear.constraints import for_target, is_of_one_target
 from optloc.linear.evaluate import predict
 from optloc.problem import noise as noises
 from optloc.problem.noise import Block, Noise
@@ -268,7 +269,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         noise=Noise(tuple(_noise_of_rows(problem.noise, kept))),
         times=(problem.times if times is None else times)[epochs],
         motions=(Motion(span="epoch"),),
-        constraints=tuple(replace(c, target=0) for c in problem.constraints if c.target in target),
+        constraints=tuple(for_target(c, 0) for c in problem.constraints if c.target in target and is_of_one_target(c)),
     )
 
 

@@ -296,14 +296,15 @@ def test_units_of_biases(tmp_path):
 
 
 def test_regions_are_drawn(tmp_path):
-    text = ranging(ranges(TRUTH)) + '[[constraints]]\nkind = "box"\nmin = [0, 0, -inf]\nmax = [3000, inf, inf]\n'
+    text = ranging(ranges(TRUTH)) + '[[constraints]]\nkind = "box"\nmin = [0, 0, -inf]\nmax = [3000, 4000, inf]\n'
     problem = load(
         write(tmp_path, text + '[[constraints]]\nkind = "polygon"\ncorners = [[0, 0], [9000, 0], [0, 9000]]\n')
     )
     fix = solve(problem)
     scene = scene_of(problem, [fix])
-    assert [len(corners) for corners in scene.regions] == [4, 3]
-    assert scene.regions[0][:, 0].tolist() == [0.0, 3000.0, 3000.0, 0.0]
-    assert np.isfinite(scene.regions[0]).all()
+    (box,), (polygon,) = (region.lines for region in scene.regions)
+    assert (len(box), len(polygon)) == (5, 4)
+    assert box[:, 0].tolist() == [0.0, 3000.0, 3000.0, 0.0, 0.0]
+    assert np.isfinite(box).all()
     figure = plot_fixes(problem, fix)
     assert "region" in [text.get_text() for text in figure.legends[0].get_texts()]

@@ -5,7 +5,8 @@ import pytest
 from optloc import InvalidProblem
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.propagation import is_time, medium_in, speed_of
-from optloc.files.schema import Units, validate
+from optloc.files.schema import validate
+from optloc.files.settings import Units
 
 REST = {"format": 2, "stations": {"file": "s.csv"}, "measurements": [{"kind": "range", "file": "r.csv"}]}
 

@@ -1,19 +1,10 @@
-"""Amounts with units, documents, and complaints about keys."""
+"""Documents, complaints about keys, and the JSON schema."""
 
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.schema import ProblemFile, Units, document_of, join, schema, validate
-
-
-def test_an_amount_is_a_number_with_its_unit():
-    assert Units("length").plain("30 ns", None, "here") == pytest.approx(30e-9 * 299792458.0)
-    assert Units("length", speed=340.0).plain("2 s", None, "here") == pytest.approx(680.0)
-    assert Units("length").plain(2.0, "km", "here") == 2000.0
-    for value, words in (("30", "has no unit"), ("soon", "is no amount"), ("1e300 m", "is beyond"), ("3 deg", "deg")):
-        with pytest.raises(InvalidProblem, match=words):
-            Units("length").plain(value, None, "here")
-
+from optloc.files.constraint_kinds import CONSTRAINT_KINDS
+from optloc.files.schema import ProblemFile, document_of, schema, validate
 
 REST = {"format": 2, "stations": {"file": "s.csv"}, "measurements": [{"kind": "range", "file": "r.csv"}]}
 
@@ -43,6 +34,9 @@ def test_the_schema_holds_every_key_of_a_file():
     assert set(schema()["properties"]) == set(ProblemFile.model_fields)
 
 
-def test_places_are_joined_from_the_file_inwards():
-    assert join("x.toml", None, "[frame]", "") == join("x.toml", "[frame]")
-    assert join("x.toml", "[frame]").startswith("x.toml")
+def test_the_schema_lists_the_kinds_of_constraints_and_their_keys():
+    table = schema()["$defs"]["ConstraintTable"]
+    assert set(CONSTRAINT_KINDS) <= set(table["properties"]["kind"]["enum"])
+    keys = {each["if"]["properties"]["kind"]["const"]: each["then"]["propertyNames"]["enum"] for each in table["allOf"]}
+    assert keys["disc"] == ["kind", "target", "name", "x", "y", "radius", "lat_deg", "lon_deg", "unit"]
+    assert {key for names in keys.values() for key in names} <= set(table["properties"])

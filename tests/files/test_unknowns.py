@@ -1,14 +1,12 @@
-"""Unknowns of a problem file: motions, priors in any unit, and constraints of each target."""
+"""Unknowns of a problem file: motions, and priors in any unit."""
 
 import numpy as np
 import pytest
 
-from optloc import InvalidProblem, Motion, station_array
-from optloc.base.frames import CARTESIAN
-from optloc.base.types import Band
-from optloc.files.schema import ConstraintTable, PriorTable, validate
+from optloc import InvalidProblem, Motion
+from optloc.files.schema import PriorTable, validate
 from optloc.files.table import Epochs
-from optloc.files.unknowns import constraints_of, motions_of, needs_clock, prior_of
+from optloc.files.unknowns import motions_of, needs_clock, prior_of
 
 REST = {"format": 2, "stations": {"file": "s.csv"}, "measurements": [{"kind": "range", "file": "r.csv"}]}
 
@@ -42,13 +40,3 @@ def test_a_prior_is_in_si_units():
     assert found.covariance == pytest.approx(900.0 * np.eye(2))
     with pytest.raises(InvalidProblem, match="1 coordinates, not 2"):
         prior_of(PriorTable(name="position", mean=[1.0], sigma="30 m"), 2, "x")
-
-
-def test_a_constraint_without_a_target_holds_for_each_that_is_estimated():
-    stations, motions = station_array([[0.0, 0.0, 0.0]]), [Motion(0, "run")] * 2
-    table = ConstraintTable(kind="box", min=[0.0, 0.0, -1.0], max=[1.0, 2.0, float("inf")], unit="km")
-    found, kept = constraints_of({"here": table}, stations, CARTESIAN, motions, ["a", "b"], np.zeros(1))
-    assert kept == tuple(motions)
-    assert all(isinstance(one, Band) for one in found)
-    assert {one.target for one in found} == {0, 1}
-    assert {name for name in ("a", "b") if any(one.name.endswith(f" of {name}") for one in found)} == {"a", "b"}

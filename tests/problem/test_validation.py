@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, assemble, measured, with_bias
-from optloc.base.types import Band, Polygon, Stations
+from optloc.base.types import Stations
 from optloc.linear.constraints import box, speed
 from optloc.problem import Prior
 from optloc.problem.noise import Block, Noise
-from optloc.problem.validation import bands_by_quantity, check_polygon, check_unknowns, check_values, checked
+from optloc.problem.validation import check_unknowns, check_values, checked
 
 PLACES = np.array([[0.0, 0.0], [9.0, 1.0], [10.0, 9.0], [1.0, 10.0]])
 ROWS = measured("range", np.full(4, 5.0), a=np.arange(4), sigma=1.0)
@@ -65,26 +65,3 @@ def test_two_unknowns_of_one_name_are_refused():
     clock = with_bias(GOOD, "clock").biases[0]
     with pytest.raises(InvalidProblem, match="the name 'position' is used twice"):
         check_unknowns(replace(GOOD, biases=(replace(clock, name="position"),)))
-
-
-@pytest.mark.parametrize(
-    ("corners", "words"),
-    [
-        ([[0, 0], [1, 0]], "only 2 corners"),
-        ([[0, 0], [1, 0], [1, 1], [0, 0]], "corner 4 repeats corner 1"),
-        ([[0, 0], [1, 1], [2, 2]], "no area"),
-        ([[0, 0], [2, 2], [2, 0], [0, 1.5]], "edges 1-2 and 3-4 meet"),
-        ([[0, 0], [1, np.nan], [1, 1]], "corner 2 is not finite"),
-    ],
-)
-def test_corners_that_bound_no_simple_polygon_are_refused(corners, words):
-    with pytest.raises(InvalidProblem, match=words):
-        check_polygon(np.array(corners, dtype=float), "polygon")
-
-
-def test_bands_on_one_quantity_are_together():
-    first, second = box([0.0, 1.0], [2.0, 3.0]), box([-1.0, -np.inf], [9.0, np.inf])
-    other = Band("plane", np.array(0.0), np.array(1.0), np.array([1.0, 0.0]), "x", target=1)
-    region = Polygon(np.array([[0, 0], [1, 0], [0, 1.0]]))
-    groups = bands_by_quantity([*first, region, *second, other])
-    assert [[band.lower.item() for band in group] for group in groups] == [[0.0, -1.0], [1.0, -np.inf], [0.0]]

@@ -24,6 +24,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.show.pictures import style
+from optloc.show.pictures.regions import DrawnRegion
 from optloc.show.pictures.style import (
     BLACK,
     BLUE,
@@ -139,8 +140,7 @@ def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = unit_of(everything[:, view])
-    if view == PLAN:
-        _draw_constraints(panel, scene, size)
+    draw_regions(panel, scene.regions, size, float(np.ptp(everything[:, :2], axis=0).max()), view)
     style.ellipses(panel, scene, view, size)
     _draw_tracks(panel, scene, view, size)
     style.stations(panel, scene, view, size)
@@ -150,13 +150,53 @@ def _draw_overview(panel: Axes, scene: PictureScene, view: View) -> float:
     return size
 
 
-def _draw_constraints(panel: Axes, scene: PictureScene, size: float) -> None:
-    """Draw the regions of constraints, polygons and boxes, in a plan with the unit `size`, m."""
-    label: str | None = "region"
-    for corners in scene.regions:
-        ring = np.concatenate([corners, corners[:1]]) / size
-        panel.plot(*ring.T, color=GREY, linewidth=1.2, linestyle="--", label=label, zorder=1)
-        label = None
+# A pale tint of `YELLOW`.
+_SAND = "#F6E0B5"
+# Styles of the shapes of constraints by their look. Hatched areas and the side of ticks are excluded.
+_LINES_OF: dict[str, dict[str, Any]] = {
+    "inside": {"colors": GREY, "linewidths": 1.2, "linestyles": "--", "zorder": 1},
+    "limit": {"colors": GREY, "linewidths": 1.2, "zorder": 1},
+    "ground": {"colors": GREY, "linewidths": 0.6, "alpha": 0.7, "zorder": 0.5},
+}
+_AREAS_OF: dict[str, dict[str, Any]] = {
+    "outside": {"facecolor": "none", "edgecolor": GREY, "hatch": "////", "linewidth": 1.2, "zorder": 0.8},
+    # One opaque colour for area and edge: overlaps of segments stay invisible, and a narrow road stays visible.
+    "road": {"facecolor": _SAND, "edgecolor": _SAND, "linewidth": 1.5, "zorder": 0.6},
+}
+# Distance between the ticks of a limit, points of 1/72 inch; and the largest extent of an outline that widens the plan,
+# in extents of the plan.
+_TICKS, _WIDENS = 7.0, 2.0
+
+
+def draw_regions(
+    panel: Axes, regions: Sequence[DrawnRegion], size: float, extent: float = 0.0, view: View = PLAN
+) -> None:
+    """Draw the shapes of constraints of a view in a panel with the unit `size`, m.
+
+    Outlines widen the plan if they are not much larger than its `extent`, m.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+    from matplotlib.patheffects import withTickedStroke
+
+    seen: set[str] = set()
+    for region in (each for each in regions if each.lines and each.view == view):
+        lines, label = [line / size for line in region.lines], None if region.label in seen else region.label
+        seen.add(region.label)
+        if region.look in _AREAS_OF:
+            rings = Outline.make_compound_path(*(Outline(line, closed=True) for line in lines))
+            # An artist without autoscaling, so that a large shape does not shrink the rest of the plan.
+            panel.add_artist(PathPatch(rings, label=label, **_AREAS_OF[region.look]))
+        else:
+            drawn = LineCollection(lines, label=label, **_LINES_OF[region.look])
+            if region.look == "limit":
+                drawn.set_path_effects([withTickedStroke(spacing=_TICKS)])
+            panel.add_collection(drawn, autolim=False)
+        if region.look in ("inside", "outside"):
+            points = np.concatenate(region.lines)
+            if np.ptp(points, axis=0).max() <= _WIDENS * extent:
+                panel.update_datalim(points / size)
 
 
 def _draw_tracks(panel: Axes, scene: PictureScene, view: View, size: float) -> None:
@@ -235,7 +275,7 @@ def _draw_surroundings(panel: Axes, scene: PictureScene) -> float:
     extent = _half_side(scene, known, centre)
     unit, size = unit_of(np.array([centre - extent, centre + extent]) - centre)
     shifted = _centred(scene, centre)
-    _draw_constraints(panel, shifted, size)
+    draw_regions(panel, shifted.regions, size)
     style.ellipses(panel, shifted, view, size)
     _draw_tracks(panel, shifted, view, size)
     style.points(panel, shifted, view, size)
@@ -252,7 +292,9 @@ def _centred(scene: PictureScene, centre: Array) -> PictureScene:
     """Return the scene with the origin of the plan at the point `centre` (2,), m."""
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
-    return replace(scene.moved(lambda place: place - shift), regions=tuple(ring - centre for ring in scene.regions))
+    return replace(
+        scene.moved(lambda place: place - shift), regions=tuple(each.moved(-centre) for each in scene.regions)
+    )
 
 
 def _half_side(scene: PictureScene, known: Array, centre: Array) -> float:

@@ -18,13 +18,14 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.outputs import visible, written
-from optloc.base.types import Array, Band, Polygon, Status
+from optloc.base.types import Array, Status
 from optloc.linear.courses import course_at, elapsed
 from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.show.pictures.outlines import outlines_of
+from optloc.show.pictures.regions import DrawnRegion, drawn_regions
 from optloc.uncertainty.outline import Outline
 
 if TYPE_CHECKING:
@@ -269,8 +270,8 @@ class PictureScene:
         Cost gaps of the alternatives.
     axes : tuple of d str
         Names of the axes.
-    regions : tuple of array (v, 2)
-        Corners of the polygons and boxes of constraints.
+    regions : tuple of DrawnRegion
+        Shapes of constraints in the plan.
     tracks : tuple of array (k, d)
         Tracks of the moving stations during the run.
     paths : tuple of array (k, d)
@@ -293,7 +294,7 @@ class PictureScene:
     alternatives: Array
     gaps: Array
     axes: tuple[str, ...]
-    regions: tuple[Array, ...] = ()
+    regions: tuple[DrawnRegion, ...] = ()
     tracks: tuple[Array, ...] = ()
     paths: tuple[Array, ...] = ()
     other_paths: tuple[Array, ...] = ()
@@ -330,8 +331,10 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
     others, gaps = _alternatives(fixes, d) if len(position) <= _FEW_FIXES else (np.zeros((0, d)), np.zeros(0))
     axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
     reach = np.concatenate([stations, position[np.isfinite(position).all(-1)]])[:, :2]
-    # In ECEF, a box of x and y has no shape in the plan.
-    regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
+    # Shapes in space are cut at the fixes. In ECEF, a box of x and y has no shape in the plan.
+    known = position[np.isfinite(position).all(-1)]
+    centre = np.median(known if len(known) else stations, axis=0)
+    regions = () if problem.frame.kind == "ecef" else drawn_regions(problem, reach, centre)
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
     outlines = _outlines(problem, fixes, len(position)) if outlined else ()
@@ -467,22 +470,6 @@ def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
     parts = [tuple(state[..., i] for i in range(state.shape[-1])) for state in states]
     rise = 0.0 if motion.rise is None else motion.rise[..., 0]
     return np.stack(course_at(problem, target, parts, elapsed(problem, target), rise), axis=-1)
-
-
-def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:
-    """Return the corners (v, 2), m, of polygons and boxes; open boxes end a little beyond the points `reach` (n, 2)."""
-    rim = 0.1 * np.ptp(reach, axis=0)
-    sides: dict[int, tuple[Array, Array]] = {}
-    for c in problem.constraints:
-        # A box is stored as bounds of single coordinates; bounds along other directions have no edges to draw.
-        if isinstance(c, Band) and c.kind == "plane" and np.ndim(c.lower) == np.ndim(c.upper) == 0:
-            along = np.flatnonzero(c.coefficients)
-            if len(along) == 1 and along[0] < 2 and c.coefficients[along[0]] == 1.0:
-                box = sides.setdefault(c.target, (reach.min(0) - rim, reach.max(0) + rim))
-                for corner, bound in zip(box, (c.lower, c.upper), strict=True):
-                    corner[along[0]] = bound if np.isfinite(bound) else corner[along[0]]
-    boxes = [np.array([[a[0], a[1]], [b[0], a[1]], [b[0], b[1]], [a[0], b[1]]]) for a, b in sides.values()]
-    return (*boxes, *(c.vertices for c in problem.constraints if isinstance(c, Polygon)))
 
 
 def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:

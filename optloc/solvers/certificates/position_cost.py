@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Band, Polygon
+from optloc.base.types import AnyOf, Array, Band, Polygon
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import exact, is_exact
 from optloc.linear.normal import eliminated, step
@@ -212,16 +212,26 @@ def _across(problem: Problem) -> list[int]:
 def admitted_states(problem: Problem, n: int) -> Array:
     """Return the least and the greatest states (2, n) that constraints admit; -inf and inf without a limit.
 
-    Bounds of one coordinate, polygons and a greatest speed count. The speed limits each component of the velocity.
+    Bounds of one coordinate, polygons, distances from points and a greatest speed count. The speed limits each
+    component of the velocity.
     """
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
     for band in problem.constraints:
         if isinstance(band, Polygon):
-            out[0, :2] = np.maximum(out[0, :2], band.vertices.min(0))
-            out[1, :2] = np.minimum(out[1, :2], band.vertices.max(0))
+            if not band.outside:
+                _limit(out, band.vertices.min(0), band.vertices.max(0))
+            continue
+        if isinstance(band, AnyOf):
+            boxes = [box for box in map(_reach, band.members) if box is not None]
+            if len(boxes) == len(band.members) and len({box.shape for box in boxes}) == 1:
+                _limit(out, np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1])
             continue
         if band.lower.ndim or band.upper.ndim:
+            continue
+        near = _reach((band,))
+        if near is not None:
+            _limit(out, near[0], near[1])
             continue
         axis = np.flatnonzero(band.coefficients)
         if band.kind == "plane" and len(axis) == 1:
@@ -231,6 +241,21 @@ def admitted_states(problem: Problem, n: int) -> Array:
         elif band.kind == "speed":
             out[0, d:], out[1, d:] = -float(band.upper), float(band.upper)
     return out
+
+
+def _limit(out: Array, low: Array, high: Array) -> None:
+    """Limit the first coordinates of the states `out` (2, n) to a box with corners (k,)."""
+    k = len(low)
+    out[0, :k], out[1, :k] = np.maximum(out[0, :k], low), np.minimum(out[1, :k], high)
+
+
+def _reach(member: tuple[Band, ...]) -> Array | None:
+    """Return the corners (2, k) of a box around a conjunction with a greatest distance; None without one."""
+    for band in member:
+        if band.kind in ("distance", "segment") and band.upper.ndim == 0 and band.coefficients.ndim == 1:
+            ends = band.coefficients.reshape(2 if band.kind == "segment" else 1, -1)
+            return np.stack([ends.min(0) - band.upper, ends.max(0) + band.upper])
+    return None
 
 
 def boxes_around(problem: Problem, state: Array) -> Array:

@@ -9,8 +9,8 @@ from math import factorial
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Band, Motion, Polygon, Stations
-from optloc.linear.constraints import is_exact, needs_velocity
+from optloc.base.types import Array, Band, Constraint, Motion, Stations
+from optloc.linear.constraints import for_target, is_exact, is_of_one_target, needs_velocity
 from optloc.linear.courses import elapsed
 from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors, without_biases
@@ -65,15 +65,16 @@ def _isolate(problem: Problem, target: int) -> Problem:
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
     # A constraint at the reference time may not apply at other times, but a known height is a good start.
+    own = [c for c in problem.constraints if c.target == target and is_of_one_target(c)]
     constraints = tuple(
-        replace(c, target=0)
-        for c in problem.constraints
-        if c.target == target and (motion.order == 0 or ((is_exact(c) or _applies_along(c)) and not needs_velocity(c)))
+        for_target(c, 0)
+        for c in own
+        if motion.order == 0 or ((is_exact(c) or _applies_along(c)) and not needs_velocity(c))
     )
     return replace(problem, motions=(motion,), constraints=constraints)
 
 
-def _applies_along(constraint: Band | Polygon) -> bool:
+def _applies_along(constraint: Constraint) -> bool:
     """Return whether a constraint applies along the whole course, not at the reference time only."""
     return isinstance(constraint, Band) and constraint.along
 

@@ -1,0 +1,69 @@
+"""By how much vectors violate the constraints of a problem. Letters: N vectors x, `size` unknowns in a vector."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
+from optloc.linear.constraints.polygons import polygon_violation
+from optloc.linear.constraints.quantities import decisive_epochs, quantity_at
+from optloc.problem.layout import state_names
+from optloc.problem.problem import Problem
+
+# Relative violation of a constraint that is accepted; a micrometre if the bound is zero. This is above the rounding of
+# coordinates of the Earth's size (a nanometre), and below the error of any measurement.
+TOLERANCE = 1e-6
+
+
+def violation(problem: Problem, x: Array) -> Array:
+    """Return the violation (N,) of the worst constraint at vectors x (N, size); 0 if all constraints are satisfied.
+
+    The violation is divided by one plus the absolute bound, or for a polygon by one plus its greatest coordinate. For a
+    union, it is that of the member which is violated least.
+    """
+    worst = np.zeros(len(x))
+    for c in problem.constraints:
+        worst = np.maximum(worst, violation_of(problem, c, x))
+    return worst
+
+
+def violation_of(problem: Problem, constraint: Constraint, x: Array) -> Array:
+    """Return the violation (N,) of one constraint at vectors x (N, size); negative or zero if it is satisfied."""
+    if isinstance(constraint, Polygon):
+        return polygon_violation(constraint, plan_positions(problem, constraint.target, x))
+    if isinstance(constraint, AnyOf):
+        return np.asarray(np.min([member_violation(problem, member, x) for member in constraint.members], axis=0))
+    return member_violation(problem, (constraint,), x)
+
+
+def member_violation(problem: Problem, member: tuple[Band, ...], x: Array) -> Array:
+    """Return the violation (N,) of the worst band of a conjunction at vectors x (N, size); negative if satisfied."""
+    worst = np.full(len(x), -np.inf)
+    with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
+        for band in member:
+            for epoch in decisive_epochs(problem, band):
+                worst = np.maximum(worst, _band_violation(band, quantity_at(problem, band, x, epoch)[0].value))
+    return worst
+
+
+def _band_violation(band: Band, value: Array) -> Array:
+    """Return the violation (N,) of the worse bound, divided by one plus the absolute bound; negative if satisfied."""
+    worst = np.full(len(value), -np.inf)
+    for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
+        with np.errstate(invalid="ignore"):
+            lacking = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
+        # One measure for metres of a height and sines of an elevation: relative to the bound, absolute near zero.
+        size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
+        worst = np.maximum(worst, lacking / size)
+    return worst
+
+
+def violation_names(problem: Problem) -> str:
+    """Return the names of all constraints, for messages."""
+    return ", ".join(dict.fromkeys(c.name for c in problem.constraints))
+
+
+def plan_positions(problem: Problem, target: int, x: Array) -> Array:
+    """Return the plan positions (N, 2) of a target in vectors x (N, size), metres."""
+    slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
+    return x[:, slot.start : slot.start + 2]
