@@ -92,7 +92,7 @@ def test_ranges_of_a_uwb_module(tmp_path, monkeypatch):
 
 
 def test_ranges_of_a_tag_below_three_anchors():
-    """UWB in a hall: freegrow-1.gitbook.io, "Understanding trilateration": anchors 2 m above the floor, tag (3, 2, 1.5).
+    """UWB in a hall: freegrow-1.gitbook.io, "Understanding trilateration": anchors 2 m high, tag (3, 2, 1.5).
 
     Anchors in one plane do not know the side. The height of the tag, one option, decides.
     """
@@ -105,7 +105,7 @@ def test_ranges_of_a_tag_below_three_anchors():
 
 
 def test_a_terminal_and_three_access_points():
-    """UWB in a hall: tutorsglobe.com, question 52203535: access points at (0, 0), (50, 0), (0, 50), measured 18, 35, 38.
+    """UWB in a hall: tutorsglobe.com, question 52203535: three access points, measured ranges 18, 35 and 38 m.
 
     The terminal is at (20, 10), so the ranging errors are -4.4, 3.4 and -6.7 m.
     """
@@ -224,8 +224,8 @@ def test_s_minus_p_times_of_an_earthquake(tmp_path, monkeypatch):
     """Earthquakes: Saint Louis University, eas.slu.edu/Outreach/eqexercise.html: S minus P of 10, 25 and 38 s.
 
     The page multiplies by 8 km/s, which are P waves of 5.84 km/s and S waves of 3.37 km/s by its ratio of 1.37. The
-    stations are in the FDSN catalogue, here to a kilometre. A focus at the surface near Jonesboro, Arkansas, fits within
-    the whole seconds: the three circles meet within 30 km.
+    stations are in the FDSN catalogue, here to a kilometre. A focus at the surface near Jonesboro, Arkansas, fits the
+    whole seconds.
     """
     monkeypatch.chdir(tmp_path)
     rows = [("MPH", 35.12, -89.93), ("UALR", 34.78, -92.34), ("SLM", 38.64, -90.24)]
