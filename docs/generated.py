@@ -111,6 +111,19 @@ def kinds() -> str:
     return "\n".join([*head, *lines])
 
 
+def constraints() -> str:
+    """Return the kinds of constraints of problem files as a table: meaning, keys, and an example of the option."""
+    from optloc.files.constraint_kinds import CONSTRAINT_KINDS
+
+    head = ["| `kind` | the target is | keys | more keys | as `--constraint` |", "|---|---|---|---|---|"]
+    lines = []
+    for name, kind in CONSTRAINT_KINDS.items():
+        needed = "; ".join(re.sub(r"\w+", r"`\g<0>`", choice).replace("/", "or") for choice in kind.needs)
+        more = " ".join(f"`{key}`" for key in kind.optional if key != "unit")
+        lines.append(f"| `{name}` | {kind.summary} | {needed} | {more} | `{kind.example}` |")
+    return "\n".join([*head, *lines])
+
+
 def columns() -> str:
     """Return the roles of columns in tables of other programs: names, allowed units and content."""
     from optloc.files.columns import roles
@@ -367,6 +380,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "costs": costs,
     "formats": formats,
     "kinds": kinds,
+    "constraints": constraints,
     "columns": columns,
     "words": words,
     "commands": commands,

@@ -103,6 +103,8 @@ class Program:
         ``h(x, p)`` on CasADi symbols (column vectors), giving m expressions as a list or a column.
     residual : callable, optional
         ``residual(x, p, z)``, m expressions, instead of ``z - h(x, p)``.
+    penalty : callable, optional
+        ``q(x, p)``, a smooth expression that is added to the cost.
     equalities, inequalities : callable, optional
         ``c(x, p)`` and ``d(x, p)``, lists or columns of expressions.
     diagonal : bool
@@ -129,6 +131,7 @@ class Program:
         h: Function | None = None,
         *,
         residual: Residual | None = None,
+        penalty: Function | None = None,
         equalities: Function | None = None,
         inequalities: Function | None = None,
         diagonal: bool = True,
@@ -151,6 +154,7 @@ class Program:
         misfit, c, d = ca.cse([misfit, c, d])
         white = weight * misfit if diagonal else weight @ misfit
         cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
+        cost += 0.0 if penalty is None else penalty(x, given)
         self._equal, self._more = c.shape[0], d.shape[0]
         # one parameter vector contains all numbers that change between solves, so the program is built and compiled
         # once

@@ -439,3 +439,11 @@ def spread_directions(count: int, d: int) -> Array:
     height, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
     radius = np.sqrt(1.0 - height**2)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """Return blocks (..., s, d, d) as block-diagonal matrices (..., s d, s d)."""
+    s, d = blocks.shape[-3], blocks.shape[-1]
+    apart = arrays.as_array_like(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
+    whole: Array = arrays.library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
+    return whole

@@ -117,7 +117,7 @@ def _unesco(celsius: float, salinity: float, decibars: float) -> float:
     # The algorithm is on the temperature scale of 1968, which was replaced in 1990.
     t, p = 1.00024 * celsius, decibars / 10.0
     pure, salty, mixed = (_polynomial(p, [_polynomial(t, row) for row in rows]) for rows in (_PURE, _SALTY, _MIXED))
-    return pure + salty * salinity + mixed * salinity**1.5 + (1.727e-3 - 7.9836e-6 * p) * salinity**2
+    return pure + salty * salinity + mixed * math.pow(salinity, 1.5) + (1.727e-3 - 7.9836e-6 * p) * salinity**2
 
 
 def pressure_at(depth: float) -> float:

@@ -343,6 +343,34 @@ class Prior:
     covariance: Array
 
 
+@dataclass(frozen=True, slots=True)
+class Fence:
+    """A half-plane that contains the target, with an uncertain boundary: ``n . x <= b + N(0, s^2)``.
+
+    It is no constraint: it adds ``-2 log Phi((b - n . x) / s)`` to the cost, where Phi is the normal distribution
+    function.
+
+    Parameters
+    ----------
+    normal : array (..., d)
+        Unit normal n, directed out of the half-plane.
+    offset : array (...)
+        Stated place b of the boundary along the normal, metres.
+    sigma : array (...)
+        Standard deviation s of this place, metres.
+    name : str
+        Name in reports.
+    target : int
+        Number of the target. Of a moving target, the position at the reference time counts.
+    """
+
+    normal: Array
+    offset: Array
+    sigma: Array
+    name: str = "fence"
+    target: int = 0
+
+
 # Status: is there an answer? Certificate: is it the best one?
 
 

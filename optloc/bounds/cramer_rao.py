@@ -16,6 +16,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at, summed
 from optloc.linear.constraints import exact, levels, tangent_at
+from optloc.linear.fences import fence_information
 from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts, with_priors
 from optloc.linear.walks import walks
 from optloc.problem.epochs import cut, has_correlated_epochs, windows
@@ -138,7 +139,7 @@ def crlb_course(
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
     # walks link each epoch to the next, so each count needs a separate sum
     total, size = (_totals_of_walks if walks(problem) else _totals)(problem, x, chosen)
-    prior = shared_priors(problem)
+    prior = shared_priors(problem) + fence_information(problem, x)
     bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
     return Course(chosen, problem.times[chosen - 1], bound, layout)
 

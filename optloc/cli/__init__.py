@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Criterion as Criterion,
         FailOne as FailOne,
         Force as Force,
+        Height as Height,
         Json as Json,
         Method as Method,
         Outside as Outside,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
         write_text as write_text,
     )
     from optloc.cli.track import TrackOptions as TrackOptions, dynamics_of as dynamics_of, rules as rules
+    from optloc.cli.wave import WaveSpeed as WaveSpeed
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

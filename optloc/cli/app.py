@@ -53,6 +53,7 @@ from optloc.cli.options import (
     constraints,
     example,
     find_problem,
+    floors_of,
     name_in,
     run_process,
 )
@@ -159,7 +160,9 @@ def fix(
     """
     from optloc.cli.fix import run_fix
 
-    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
+    floors = floors_of(height)
+    one = f"{floors[0]!r} m" if floors else height
+    more, passing = constraints(one, above_ground, box, constraint or ()), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
         file,
@@ -174,6 +177,7 @@ def fix(
         explain=explain,
         allow=passing,
         table=table_hints(file, given),
+        floors=floors,
     )
     raise typer.Exit(code)
 
@@ -217,6 +221,7 @@ def track(
         str | None,
         typer.Option(metavar="P[,V[,A]]", help="Standard deviations of --start: position, velocity, acceleration."),
     ] = None,
+    height: Height = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
@@ -232,8 +237,8 @@ def track(
 
     wanted = TrackOptions(model, filter_, noise, memory, rules(gate, gap, loss), start, start_sigma, loss)
     files = {"out": out, "plot": plot, "html": html}
-    hints = table_hints(file, given)
-    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=hints))
+    hints, more = table_hints(file, given), constraints(height, False, None)
+    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=hints, more=more))
 
 
 @app.command(

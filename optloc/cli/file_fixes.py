@@ -74,14 +74,22 @@ class FileFixes:
         yield from (flat[i] for i in range(len(flat)))
 
 
-def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
-    """Return the fixes of a file; on a terminal, a progress bar is drawn on standard error."""
+def _solve(problem: Problem, method: str, floors: Sequence[float]) -> Fix:
+    """Return the fix of a problem; with `floors`, m, the best of the fixes at these heights."""
+    from optloc.solvers.floors import at_height, solve_on_floors
     from optloc.solvers.solution import solve
 
+    if not floors:
+        return solve(problem, method=method)
+    return solve_on_floors([at_height(problem, height) for height in floors], method)
+
+
+def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
+    """Return the fixes of a file; on a terminal, a progress bar is drawn on standard error."""
     if separable(loaded.problem):
         fix, reweighted = fix_epochs(loaded, method, quiet)
         return FileFixes(loaded, fix, fix_columns(loaded, fix, 0), reweighted)
-    fix = solve(loaded.problem, method=method)
+    fix = _solve(loaded.problem, method, loaded.floors)
     _log_stages(fix)
     reweighted = _is_reweighted(fix, loaded.problem)
     return FileFixes(loaded, fix, fix_columns(loaded, fix, None), reweighted, _observe(loaded.problem, fix))
@@ -93,7 +101,6 @@ def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
     `method` is the method as in `optloc.solve`. `quiet` hides the progress bar.
     """
     from optloc.solvers.methods import is_quick
-    from optloc.solvers.solution import solve
 
     reweighted, order, stages = False, [], {}  # `order` has the epoch numbers of the fixes, in the order of the fixes
 
@@ -105,7 +112,7 @@ def fix_epochs(loaded: Loaded, method: str, quiet: bool) -> tuple[Fix, bool]:
         sizes = [_QUICK_CHUNK if is_quick(group.take(slice(_CHUNK)).problem, method) else _CHUNK for group in groups]
         for part in (part for group, size in zip(groups, sizes, strict=True) for part in group.parts(size)):
             problem = part.problem
-            fix = solve(problem, method=method)
+            fix = _solve(problem, method, loaded.floors)
             _log_stages(fix)
             order.append(part.epochs)
             stages.update({stage.name: stage for stage in fix.stages})

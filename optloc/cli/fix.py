@@ -89,21 +89,24 @@ def run_fix(
     explain: bool = False,
     allow: tuple[Status, ...] = (),
     table: ColumnHints | WaveOptions | None = None,
+    floors: tuple[float, ...] = (),
 ) -> int:
     """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
 
     `more` has the constraints by the name of their option. `as_json` prints JSON, and `quiet` prints nothing. `out`,
     `geojson_path`, `plot` and `html` are the files to write: results, GeoJSON, picture and page; None for no file.
     `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table, or the
-    options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the grouping of
-    `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to the stated noise.
-    `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
+    options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the
+    grouping of `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to it.
+    `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error. `floors`
+    are the heights on one of which the target is, m; `more` then states one of them.
     """
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
     loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
+    loaded = replace(loaded, floors=floors)
     claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None

@@ -289,7 +289,7 @@ def _json(found: Converted) -> dict[str, Any]:
 # Tables instead of problem files.
 
 
-def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptions:
+def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptions | None:
     """Return the column hints of a table; for a problem file, the options on the wave.
 
     `given` has the values of the table options. Raise InvalidProblem for a problem file with options of tables.
@@ -298,7 +298,7 @@ def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptio
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
         return ColumnHints(**given)
-    wave: WaveOptions = given["wave"]
+    wave: WaveOptions | None = given.get("wave")
     stated = [name for name, value in given.items() if value and name != "wave"]
     if stated:
         flag = {"what": "--as", "columns": "--column"}.get(stated[0], f"--{stated[0].replace('_', '-')}")

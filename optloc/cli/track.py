@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -31,6 +31,7 @@ from optloc.cli.output import (
     write_results,
     write_text,
 )
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
@@ -112,17 +113,18 @@ def run_track(
     html: Path | None = None,
     quiet: bool = False,
     table: ColumnHints | WaveOptions | None = None,
+    more: Mapping[str, ConstraintTable] | None = None,
 ) -> int:
     """Track the targets of a file or a table, write the requested files, and return the exit code.
 
-    `wanted` has the options of the tracks. After an error, the track so far is written first. A killed run leaves a CSV
-    file next to `out`, with ``.partial`` appended to its name. At most the rows of the last tenth of a second are
-    missing.
+    `wanted` has the options of the tracks, and `more` further constraints by the name of their option. After an error,
+    the track so far is written first. A killed run leaves a CSV file next to `out`, with ``.partial`` appended to its
+    name. At most the rows of the last tenth of a second are missing.
     """
     dynamics = dynamics_of(wanted)
     # Reject wrong names before reading the file.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
-    loaded = read_problem(file, table, quiet=quiet or as_json)
+    loaded = read_problem(file, table, more, quiet=quiet or as_json)
     claim_outputs(html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:

@@ -284,6 +284,7 @@ def is_planned(problem: Problem) -> bool:
         shared.append((stations.axes, 4))
     return (
         len(problem.motions) == 1
+        and not problem.fences
         and (motion.order, motion.span) == (0, "run")
         and motion.known is None
         and all(bool((r.target == 0).all()) for r in problem.rows)

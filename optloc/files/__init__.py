@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from optloc.files.constraint_files import StatedConstraint as StatedConstraint
     from optloc.files.constraint_reader import limits_of as limits_of
+    from optloc.files.constraint_table import ConstraintTable as ConstraintTable
     from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (
         Context as Context,
@@ -65,6 +66,12 @@ if TYPE_CHECKING:
     from optloc.files.stations import survey as survey
     from optloc.files.table import Table as Table, of_rows as of_rows, table_of as table_of
     from optloc.files.unknowns import FREE as FREE, places_of as places_of, settle_frame as settle_frame
+    from optloc.files.wave_speed import (
+        WaveOptions as WaveOptions,
+        stated_speed as stated_speed,
+        with_options as with_options,
+        with_profile as with_profile,
+    )
     from optloc.files.words import distinct as distinct
     from optloc.files.writer import harmless_column as harmless_column, toml_text as toml_text
 

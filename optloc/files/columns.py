@@ -74,7 +74,10 @@ def _role(text: str, names: str, units: Iterable[str] = (), with_unit: str = "")
 
 
 _MESSAGES = "message msg messageid msgid pulse frame epoch event eventid burst shot seq"
-_STATIONS = f"station receiver rx sensor anchor beacon site observer node stationid receiverid sensorid a {_FIRST}"
+_STATIONS = (
+    "station receiver rx sensor anchor beacon site observer node microphone mic hydrophone recorder transponder "
+    f"geophone stationid receiverid sensorid a {_FIRST}"
+)
 _FIXED = {
     "message": _role("label of a message, pulse or epoch", _MESSAGES),
     "station": _role("station of the row", _STATIONS),

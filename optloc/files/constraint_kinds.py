@@ -14,15 +14,15 @@ from typing import Any, cast
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest, no_station
-from optloc.base.types import Array, Constraint, Motion
-from optloc.base.units import UNITS
+from optloc.base.types import Array, Constraint, Fence, Motion
+from optloc.base.units import UNITS, Quantity
 from optloc.files.constraint_values import ConstraintValues
 from optloc.linear import constraints
 from optloc.models.surfaces import SURFACES
 from optloc.problem.constraint_checks import check_polygon
 
-Made = Sequence[Constraint] | tuple[Motion, Sequence[Constraint]]
-"""Constraints; a height along a course also determines the motion that can keep it."""
+Made = Sequence[Constraint | Fence] | tuple[Motion, Sequence[Constraint]]
+"""Constraints and fences; a height along a course also determines the motion that can keep it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class ConstraintKind:
     ----------
     make : callable
         Returns the constraints of the values of a table.
-    needs : tuple of tuple of str
-        Sets of keys: all keys of at least one set must be given.
+    needs : tuple of str
+        What must be given, each as the possible sets of keys: "x y / lat_deg lon_deg".
     summary : str
         What the constraint states, for lists.
     optional : tuple of str
@@ -44,7 +44,7 @@ class ConstraintKind:
     """
 
     make: Callable[[ConstraintValues], Made]
-    needs: tuple[tuple[str, ...], ...]
+    needs: tuple[str, ...]
     summary: str
     optional: tuple[str, ...] = ()
     example: str = ""
@@ -52,7 +52,13 @@ class ConstraintKind:
     @property
     def keys(self) -> tuple[str, ...]:
         """Return all keys of the kind, without the keys that every kind has."""
-        return tuple(dict.fromkeys([key for keys in self.needs for key in keys] + list(self.optional)))
+        needed = [key for choice in self.needs for keys in _sets(choice) for key in keys]
+        return tuple(dict.fromkeys([*needed, *self.optional]))
+
+
+def _sets(choice: str) -> list[list[str]]:
+    """Return the possible sets of keys of an entry of `ConstraintKind.needs`."""
+    return [keys.split() for keys in choice.split("/")]
 
 
 COMMON = ("kind", "target", "name")
@@ -92,15 +98,16 @@ def check_keys(name: str, given: set[str], where: str) -> None:
     if foreign:
         advice = nearest(foreign[0], kind.keys) if kind.keys else "remove it"
         raise InvalidProblem(f"{name} has no key {foreign[0]!r}", where, advice)
-    if not kind.needs or any(given.issuperset(keys) for keys in kind.needs):
-        return
-    closest = max(kind.needs, key=lambda keys: len(given.intersection(keys)))
-    missing = [key for key in closest if key not in given]
-    if len(missing) == len(closest):
-        sets = " or ".join(", ".join(keys) for keys in kind.needs)
-        noun = "bound" if all(len(keys) == 1 for keys in kind.needs) else "values"
-        raise InvalidProblem(f"{name} has no {noun}", where, f"give {sets}")
-    raise InvalidProblem(f"{name} has no {missing[0]!r}", where, f"add the key {missing[0]!r}")
+    for choice in kind.needs:
+        sets = _sets(choice)
+        if any(given.issuperset(keys) for keys in sets):
+            continue
+        closest = max(sets, key=lambda keys: len(given.intersection(keys)))
+        missing = [key for key in closest if key not in given]
+        if len(sets) == 1 or len(missing) < len(closest):
+            raise InvalidProblem(f"{name} has no {missing[0]!r}", where, f"add the key {missing[0]!r}")
+        advice = f"give {' or '.join(', '.join(keys) for keys in sets)}"
+        raise InvalidProblem(f"{name} has no {_NOUNS.get(choice, 'shape')}", where, advice)
 
 
 # Constructors. Each gets the values of a table, and calls a function of `optloc.constraints`.
@@ -116,6 +123,12 @@ def _band(v: ConstraintValues) -> Made:
     """Return the band ``min <= normal . position <= max``."""
     v.plan()
     return constraints.band(v.direction(), *v.bounds("length"), **v.naming)
+
+
+def _fence(v: ConstraintValues) -> Made:
+    """Return a half-plane with an uncertain boundary: a term of the cost."""
+    v.plan()
+    return constraints.fence(v.direction(), v.amount("offset"), v.positive("sigma"), **v.naming)
 
 
 def _disc(v: ConstraintValues) -> Made:
@@ -269,12 +282,25 @@ def _height(v: ConstraintValues) -> Made:
 def _level(v: ConstraintValues, low: float, high: float) -> Made:
     """Return the motion that can keep a height between two values, m, and the constraint.
 
-    A moving target with a height along its course follows the Earth.
+    On Earth, a moving target with a height along its course follows the Earth. Elsewhere the height is the third
+    coordinate.
     """
+    if not v.frame.geodetic:
+        return _level_plane(v, low, high)
     # bounds of a height that may curve hold at one time: inside them at both ends, the course may still leave them
     along = v.given["along"] if v.has("along") else v.motion.order < 2 or low == high
     over = replace(v.motion, over="ground") if along and moves(v.motion) else v.motion
     return over, constraints.height(low, high, along=along, **v.naming)
+
+
+def _level_plane(v: ConstraintValues, low: float, high: float) -> Made:
+    """Return the constraint on the third coordinate in a frame that is not on Earth."""
+    if v.dimension != 3:
+        advice = "give x, y, z of each station, or remove the height"
+        raise InvalidProblem("stations in the plane have no height", v.where, advice)
+    along = v.given["along"] if v.has("along") else v.motion.order < 2 or low == high
+    planes = constraints.box([-np.inf, -np.inf, low], [np.inf, np.inf, high], **v.naming)
+    return [replace(plane, name="height", along=along) for plane in planes[2:]]
 
 
 def moves(motion: Motion) -> bool:
@@ -373,137 +399,130 @@ def _quantity(v: ConstraintValues) -> Made:
         what = f"{v.kind} has {len(given)} coefficients, not {wanted}"
         raise InvalidProblem(what, v.place("coefficients"), "give SI numbers, in the order of the quantity")
     # Bounds in units need a quantity whose SI unit optloc knows; bounds of other quantities are plain numbers.
-    quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
+    quantity: Quantity = next((name for name, units in UNITS.items() if next(iter(units)) == surface.unit), "plain")
     lower, upper = v.bounds(quantity)
     return constraints.quantity(v.kind, lower, upper, np.array(given, dtype=float), **v.naming)
 
 
-# Sets of keys of a point: in the frame, or on Earth.
-_CENTRE = (("x", "y"), ("lat_deg", "lon_deg"))
-
-
-def _around(*keys: str) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of keys of a shape around a centre; `keys` are the other keys of the shape."""
-    return tuple((*centre, *keys) for centre in _CENTRE)
-
-
-_BOUNDS = (("min",), ("max",))
+# Choices of several kinds: a centre, bounds, and the corners of a polygon; and how messages name them.
+_CENTRE, _BOUNDS, _LEVELS = "x y / lat_deg lon_deg", "min / max", "exactly / min / max"
+_CORNERS = "corners / corners_deg / file"
+_NOUNS = {_CENTRE: "centre", _BOUNDS: "bound", _LEVELS: "bound", _CORNERS: "corners"}
 
 CONSTRAINT_KINDS: dict[str, ConstraintKind] = {
     "half-plane": ConstraintKind(
         _half_plane,
-        (("normal", "offset"),),
-        "normal . position is at most the offset; in space a half-space",
+        ("normal", "offset"),
+        "on one side of a line or plane: normal · position is at most the offset",
         ("unit",),
         "half-plane normal=1,0 offset=2 km",
     ),
+    "fence": ConstraintKind(
+        _fence,
+        ("normal", "offset", "sigma"),
+        "on one side of a line or plane at an uncertain place; beyond it, the target is improbable",
+        ("unit",),
+        "fence normal=1,0 offset=2 km sigma=50 m",
+    ),
     "band": ConstraintKind(
         _band,
-        (("normal", "min"), ("normal", "max")),
-        "normal . position is between min and max",
+        ("normal", _BOUNDS),
+        "between two parallel lines or planes: normal · position is between min and max",
         ("unit",),
         "band normal=1,1 min=0 max=2 km",
     ),
     "disc": ConstraintKind(
-        _disc, _around("radius"), "in a disc of the plan", ("unit",), "disc x=3 km y=2 km radius=500 m"
+        _disc, (_CENTRE, "radius"), "in a disc of the plan", ("unit",), "disc x=3 km y=2 km radius=500 m"
     ),
     "annulus": ConstraintKind(
         _annulus,
-        _around("inner", "outer"),
+        (_CENTRE, "inner", "outer"),
         "in a ring of the plan",
         ("unit",),
         "annulus x=0 y=0 inner=1 km outer=2 km",
     ),
     "keep-out-disc": ConstraintKind(
         _keep_out_disc,
-        _around("radius"),
+        (_CENTRE, "radius"),
         "outside a disc of the plan",
         ("unit",),
         "keep-out-disc lat=47.1 lon=8.2 radius=1 nmi",
     ),
     "ball": ConstraintKind(
-        _ball, _around("radius"), "in a ball", ("z", "height", "unit"), "ball x=0 y=0 z=100 radius=2 km"
+        _ball, (_CENTRE, "radius"), "in a ball", ("z", "height", "unit"), "ball x=0 y=0 z=100 radius=2 km"
     ),
     "keep-out-ball": ConstraintKind(
         _keep_out_ball,
-        _around("radius"),
+        (_CENTRE, "radius"),
         "outside a ball",
         ("z", "height", "unit"),
         "keep-out-ball x=0 y=0 z=100 radius=50 m",
     ),
     "polygon": ConstraintKind(
-        _polygon,
-        (("corners",), ("corners_deg",), ("file",)),
-        "in a polygon of the plan, convex or not",
-        ("unit",),
-        "polygon file=area.geojson",
+        _polygon, (_CORNERS,), "in a polygon of the plan, convex or not", ("unit",), "polygon file=area.geojson"
     ),
     "keep-out-polygon": ConstraintKind(
         _keep_out_polygon,
-        (("corners",), ("corners_deg",), ("file",)),
+        (_CORNERS,),
         "outside a polygon of the plan",
         ("unit",),
         "keep-out-polygon corners=[[0,0],[900,0],[0,900]]",
     ),
     "polyhedron": ConstraintKind(
         _polyhedron,
-        (("normals", "offsets"),),
-        "each normal . position is at most its offset",
+        ("normals", "offsets"),
+        "in a convex region: each normal · position is at most its offset",
         ("unit",),
         "polyhedron normals=[[1,0],[0,1]] offsets=900,800",
     ),
     "polyline": ConstraintKind(
         _polyline,
-        (("points", "tolerance"), ("points_deg", "tolerance"), ("file", "tolerance")),
-        "within a tolerance of a line, such as a road or a track",
+        ("points / points_deg / file", "tolerance"),
+        "near a line, such as a road or a track",
         ("unit",),
         "polyline file=road.geojson tolerance=10 m",
     ),
     "terrain": ConstraintKind(
         _terrain,
-        tuple((*source, bound) for source in (("file",), ("x", "y", "height")) for bound in ("exactly", "min", "max")),
-        "height above a grid of heights",
+        ("file / x y height", _LEVELS),
+        "at a height above the ground of a grid",
         ("unit",),
         "terrain file=ground.asc exactly=2 m",
     ),
     "height": ConstraintKind(
         _height,
-        (("exactly",), *_BOUNDS),
-        "height above the WGS 84 ellipsoid",
+        (_LEVELS,),
+        "at a height above the WGS 84 ellipsoid",
         ("within", "unit", "along"),
         "height exactly=1640 ft",
     ),
-    "above-ground": ConstraintKind(
-        _above_ground,
-        (),
-        "height above the WGS 84 ellipsoid is at least 0",
-        ("along",),
-        "above-ground",
+    "above-ground": ConstraintKind(_above_ground, (), "above the WGS 84 ellipsoid", ("along",), "above-ground"),
+    "box": ConstraintKind(
+        _box, (_BOUNDS,), "in a box: each coordinate is in a range", ("unit",), "box min=0,0 max=5000,4000"
     ),
-    "box": ConstraintKind(_box, _BOUNDS, "each coordinate is in a range", ("unit",), "box min=0,0 max=5000,4000"),
     "visible": ConstraintKind(
-        _visible,
-        (),
-        "stations are above the horizon of the target",
-        ("stations", "elevation"),
-        "visible elevation=5 deg",
+        _visible, (), "where stations are above the horizon", ("stations", "elevation"), "visible elevation=5 deg"
     ),
-    "speed": ConstraintKind(_speed, _BOUNDS, "speed of a moving target", ("unit", "along"), "speed max=90 km/h"),
+    "speed": ConstraintKind(_speed, (_BOUNDS,), "at a speed in a range", ("unit", "along"), "speed max=90 km/h"),
     "turn-rate": ConstraintKind(
-        _turn_rate, (("max",),), "turn rate of a course with an acceleration", ("min", "unit"), "turn-rate max=3 deg/s"
+        _turn_rate,
+        ("max",),
+        "on a course with an acceleration and a bounded turn rate",
+        ("min", "unit"),
+        "turn-rate max=3 deg/s",
     ),
     "acceleration": ConstraintKind(
-        _acceleration, (("max",),), "acceleration of a course", ("unit",), "acceleration max=2 m/s^2"
+        _acceleration, ("max",), "on a course with a bounded acceleration", ("unit",), "acceleration max=2 m/s^2"
     ),
     "separation": ConstraintKind(
         _separation,
-        (("between", "min"), ("between", "max")),
-        "distance between two targets",
+        ("between", _BOUNDS),
+        "at a distance from another target",
         ("unit", "along"),
         "separation between=A,B min=50 m",
     ),
 }
-"""Kinds of constraints by name."""
+"""Kinds of constraints by name. The summary continues the words "the target is"."""
 
-QUANTITY = ConstraintKind(_quantity, _BOUNDS, "a registered quantity", ("coefficients", "unit"))
+QUANTITY = ConstraintKind(_quantity, (_BOUNDS,), "a registered quantity", ("coefficients", "unit"))
 """Keys of a quantity that a package registers in the group `optloc.constraints`."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import AnyOf, Array, Band, Constraint, Motion, Polygon, Stations
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Motion, Polygon, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.constraint_files import StatedConstraint, stated
 from optloc.files.constraint_kinds import ConstraintKind, check_keys, kind_of, moves
@@ -19,13 +19,16 @@ from optloc.files.constraint_table import ConstraintTable, constraint_table
 from optloc.files.constraint_values import ConstraintValues
 from optloc.files.schema import ProblemFile
 from optloc.files.settings import join
+from optloc.linear.constraints import for_target
 from optloc.problem.constraint_checks import bands_by_quantity
 
-Demand = StatedConstraint | Sequence[Constraint]
+Limit = Constraint | Fence
+"""A constraint, or a half-plane with an uncertain boundary."""
+Demand = StatedConstraint | Sequence[Limit]
 """A table with the contents of its file, or finished constraints."""
 
 
-StatedConstraints: TypeAlias = "Sequence[Mapping[str, object] | Constraint | Sequence[Constraint]]"
+StatedConstraints: TypeAlias = "Sequence[Mapping[str, object] | Limit | Sequence[Limit]]"
 """Constraints as a Python argument: tables as in problem files, constraints of `optloc.constraints`, or a mixture."""
 
 
@@ -59,8 +62,8 @@ def stated_arguments(given: StatedConstraints) -> dict[str, Demand]:
         parts = each if isinstance(each, tuple | list) else [each]
         if isinstance(each, Mapping):
             found[where] = stated(constraint_table(each, where), None, where)
-        elif all(isinstance(part, Band | Polygon | AnyOf) for part in parts):
-            found[where] = [part for part in parts if isinstance(part, Band | Polygon | AnyOf)]
+        elif all(isinstance(part, Band | Polygon | AnyOf | Fence) for part in parts):
+            found[where] = [part for part in parts if isinstance(part, Band | Polygon | AnyOf | Fence)]
         else:
             advice = 'give optloc.constraints.disc(...), or a table such as {"kind": "box", "min": [0.0, 0.0]}'
             raise InvalidProblem(f"{type(each).__name__} is no constraint", where, advice)
@@ -75,7 +78,7 @@ def constraints_of(
     names: Sequence[str],
     times: Array,
     speed: float = SPEED_OF_LIGHT,
-) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
     """Return the constraints of tables, and motions that can satisfy them.
 
     Constraints on one quantity of one target are joined. If a height holds along a course, all moving targets follow
@@ -104,7 +107,7 @@ def constraints_of(
     InvalidProblem
         The message has the place of the table, the key and a next step.
     """
-    found: list[Constraint] = []
+    found: list[Limit] = []
     motions = list(motions)
     for where, demand in demands.items():
         if not isinstance(demand, StatedConstraint):
@@ -139,15 +142,12 @@ def _made(kind: ConstraintKind, values: ConstraintValues) -> Any:
         raise InvalidProblem(error.what, values.where, error.advice) from None
 
 
-def _of_target(constraint: Constraint, target: int, suffix: str) -> Constraint:
+def _of_target(constraint: Limit, target: int, suffix: str) -> Limit:
     """Return a constraint with the number of its target, and with an ending of its name."""
-    if isinstance(constraint, AnyOf):
-        members = tuple(
-            tuple(replace(band, target=target, name=band.name + suffix) for band in member)
-            for member in constraint.members
-        )
-        return replace(constraint, members=members, target=target, name=constraint.name + suffix)
-    return replace(constraint, target=target, name=constraint.name + suffix)
+    name = constraint.name + suffix
+    if isinstance(constraint, Fence):
+        return replace(constraint, target=target, name=name)
+    return replace(for_target(constraint, target), name=name)
 
 
 def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[str], where: str) -> list[int]:
@@ -178,8 +178,9 @@ def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[
     return [list(names).index(table.target) if len(motions) > 1 else 0]
 
 
-def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
-    """Yield the intersection of the bands on each quantity, and each polygon and each union once."""
+def _merge(limits: Sequence[Limit]) -> Iterator[Limit]:
+    """Yield the intersection of the bands on each quantity, each polygon and each union once, and all fences."""
+    constraints = [limit for limit in limits if not isinstance(limit, Fence)]
     # Keep two bands that contradict each other: the check of the problem reports them.
     for bands in bands_by_quantity(constraints):
         if any(np.ndim(bound) for band in bands for bound in (band.lower, band.upper)):
@@ -189,4 +190,5 @@ def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)
     yield from {(c.target, c.outside, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()
-    yield from (c for c in constraints if not isinstance(c, Band | Polygon))
+    yield from {(c.target, str(c.members)): c for c in constraints if isinstance(c, AnyOf)}.values()
+    yield from (limit for limit in limits if isinstance(limit, Fence))

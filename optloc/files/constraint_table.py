@@ -37,7 +37,7 @@ class ConstraintTable(FileTable):
 
     model_config = ConfigDict(json_schema_extra=_conditions)
 
-    kind: str = Field(json_schema_extra=lambda schema: schema.update(enum=kind_names()))
+    kind: str = Field(json_schema_extra=lambda schema: schema.update(enum=[*kind_names()]))
     """Kind of the constraint; each kind has different keys."""
     target: str | None = None
     """Name of the target; by default all targets."""
@@ -50,8 +50,8 @@ class ConstraintTable(FileTable):
     within: Amount | None = None
     """Half width of a band around `exactly`."""
     along: bool | None = None
-    """Whether the limit of a moving target holds at all times, or only at the reference time. Heights and separations hold
-    at all times by default; a target with a height along its course follows the Earth."""
+    """Whether the limit of a moving target holds at all times, or only at the reference time. By default, heights and
+    separations hold at all times; a target with a height along its course follows the Earth."""
     min: Amount | list[Bound] | None = None
     """Least value; least coordinates of a box in the frame, -inf for no bound."""
     max: Amount | list[Bound] | None = None
@@ -75,9 +75,11 @@ class ConstraintTable(FileTable):
     outer: Amount | None = None
     """Outer radius of an annulus."""
     normal: list[float] | None = None
-    """Direction across a half-plane or a band, of any length."""
+    """Direction across a half-plane, a band or a fence, of any length."""
     offset: Amount | None = None
-    """Greatest value of normal . position for a normal of any length, such as "2 km"."""
+    """Greatest value of normal . position, such as "2 km" for a normal of length one."""
+    sigma: Amount | None = None
+    """Standard deviation of the place of a fence."""
     normals: Points | None = Field(default=None, max_length=_MOST)
     """Outward normals of a polyhedron."""
     offsets: list[float] | None = Field(default=None, max_length=_MOST)
@@ -150,6 +152,8 @@ def constraint_of_text(text: str, where: str) -> ConstraintTable:
     ends = [*(key.start() for key in keys[1:]), len(rest)][: len(keys)]
     values: dict[str, Any] = {"kind": first}
     for key, end in zip(keys, ends, strict=True):
+        if key[1] in values:
+            raise InvalidProblem(f"the key {key[1]!r} is given twice", where, "remove one of them")
         values[key[1]] = _value(rest[key.end() : end].strip())
     return constraint_table(values, where)
 

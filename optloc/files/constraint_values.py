@@ -135,14 +135,18 @@ class ConstraintValues:
             keys = "xyz"[:dimension]
             missing = next((key for key in keys if not self.has(key)), None)
             if missing is not None:
-                raise InvalidProblem(f"{self.kind} has no {missing}", self.where, f"add the key {missing!r}")
+                raise InvalidProblem(f"{self.kind} has no {missing!r}", self.where, f"add the key {missing!r}")
             return np.array([self.amount(key) for key in keys])
         for key in "xyz":
             if self.has(key):
                 what = "the centre is given twice"
                 raise InvalidProblem(what, self.place(key), "give x and y, or lat_deg and lon_deg")
+        if dimension == _SPACE and not self.has("height"):
+            advice = "add the key 'height', metres above the ellipsoid"
+            raise InvalidProblem(f"{self.kind} has no 'height'", self.where, advice)
         height = [self.amount("height")] if self.has("height") else []
-        return self._geodetic([[self.given["lat_deg"], self.given["lon_deg"], *height]], "lat_deg", dimension)[0]
+        place = [self.given["lat_deg"], self.given["lon_deg"], *height]
+        return np.asarray(self._geodetic([place], "lat_deg", dimension)[0])
 
     def points(self, stem: str, sizes: Sequence[int]) -> Array:
         """Return the points (v, 2 or 3) under a key in `unit`, or under the same key with the ending "_deg".
@@ -184,7 +188,10 @@ class ConstraintValues:
         return np.asarray(found[:, :dimension])
 
     def direction(self, key: str = "normal") -> Array:
-        """Return the direction (2 or 3,) under a key: a list of numbers without a unit, at most d."""
+        """Return the direction (d,) under a key: a list of numbers without a unit.
+
+        In space, two numbers are a direction of the plan.
+        """
         value = self.given[key]
         if not isinstance(value, list) or not _PLAN <= len(value) <= self.dimension:
             count = f"{len(value)} coordinates" if isinstance(value, list) else "one number"
@@ -195,4 +202,4 @@ class ConstraintValues:
         found = np.array(value, dtype=float)
         if not found.any():
             raise InvalidProblem(f"{key} is zero", self.place(key), "give a direction, such as [1.0, 0.0]")
-        return found
+        return np.append(found, np.zeros(self.dimension - len(found)))

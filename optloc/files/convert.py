@@ -156,7 +156,8 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
-    return with_wave(table_problem, hints.wave)
+    stated = f"exactly = {json.dumps(hints.height)}" if hints.height is not None else table_problem.height
+    return with_wave(replace(table_problem, height=stated), hints.wave)
 
 
 def _of_table(source: Path, hints: ColumnHints) -> TableProblem:

@@ -205,8 +205,8 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
     if section.positive == "b-farther" and not _is_difference(model):
         raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
     if kind != "range" and (section.two_way or section.turn_around is not None):
-        key = "two_way" if section.two_way else "turn_around"
-        raise InvalidProblem(f"{kind} has no way back", join(c.where, f"key {key!r}"), "remove it; it is for range")
+        place = join(c.where, "key 'two_way'" if section.two_way else "key 'turn_around'")
+        raise InvalidProblem(f"{kind} has no way back", place, "remove it; it is for range")
     if kind != "azimuth":
         north = section.azimuth not in {None, "east-counterclockwise"}
         key = "azimuth" if north else "declination" if section.declination is not None else None

@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
-from optloc.base.types import Amount, Array, Band, Constraint, Motion, Stations, Status
-from optloc.base.units import SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion, in_si
+from optloc.base.moved import renamed
+from optloc.base.types import Amount, Array, Band, Motion, Stations, Status
+from optloc.base.units import AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
-from optloc.files.constraint_reader import StatedConstraints, constraints_of, stated_arguments
+from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
 from optloc.files.physics import warn_of_values
 from optloc.files.propagation import is_time
@@ -29,14 +30,15 @@ from optloc.files.schema import FrameTable, StationsTable
 from optloc.files.settings import Units
 from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
+from optloc.files.wave_argument import Wave, check_times, wave_of, with_speed
 from optloc.linear import constraints
 from optloc.model_checks.plausibility import refuse_impossible
 from optloc.models import MODELS
 from optloc.models.medium import Medium
-from optloc.problem.bias import scale_of
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.solvers.floors import solve_on_floors
 from optloc.solvers.solution import solve
 
 if TYPE_CHECKING:
@@ -51,12 +53,12 @@ Values: TypeAlias = (
 
 # Smallest distance of a point on Earth from the centre (at the poles), metres.
 _SURFACE = 6.3e6
-# Arrivals differ at most by the distance between two stations. This multiple of it means a wrong unit.
-_TOO_FAR = 100.0
 # Caches of receivers and of unit conversions with standard deviations: repeated calls reuse them.
 _PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
 # Quantities whose bounds determine the level of a target.
 _LEVELS = ("height", "terrain")
+# Length of a band of heights: the least and the greatest.
+_BAND = 2
 # Largest rounding of an instant as a float, as a share of its standard deviation; less has no effect.
 _STEP = 0.1
 
@@ -101,13 +103,14 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
 @overload
 def locate(
@@ -123,13 +126,14 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
 def locate(
     stations: Places | None = None,
@@ -144,13 +148,14 @@ def locate(
     sigma: Amount | Mapping[str, Amount] | None = None,
     unit: str | Mapping[str, str] | None = None,
     reference: str | None = None,
-    height: Amount | Sequence[Amount] | None = None,
+    height: Amount | Collection[Amount] | None = None,
     constraints: StatedConstraints = (),
     azimuth: str = COMPASS,
     declination: Amount | date | None = None,
     frame: str = "cartesian",
-    speed: Amount | tuple[Amount, Amount] | Medium = SPEED_OF_LIGHT,
+    wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
     method: str = "auto",
+    speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix:
     """Return the fix of a target from the measurements of receivers, in one call.
 
@@ -187,9 +192,9 @@ def locate(
         Unit of the values: "ns", "km", "rad" and others.
     reference : str, optional
         Reference station of time differences; by default the first.
-    height : float, str, or (least, greatest), optional
+    height : float, str, (least, greatest), set or list, optional
         Known height of the target, metres or text such as "1640 ft": above the WGS 84 ellipsoid, or along z if the
-        frame is not on Earth.
+        frame is not on Earth. A set, or a list of three or more, has the floors on one of which the target is.
     constraints : sequence of constraints or mappings, optional
         Constraints of `optloc.constraints`, or tables as in problem files, such as
         ``{"kind": "disc", "lat": 47.1, "lon": 8.2, "radius": "2 km"}``.
@@ -201,12 +206,15 @@ def locate(
         Earth. It is added to compass bearings.
     frame : "cartesian" or "ecef"
         Frame of x, y, z of the stations.
-    speed : float, str, (float, float), Layers or Atmosphere
-        Propagation speed, m/s or text such as "1480 m/s": light, `optloc.units.sound_in_air` or `sound_in_water`. Rays
-        bend through `optloc.models.Layers` and `optloc.models.Atmosphere`. A pair is a speed and its standard
-        deviation: the speed is then estimated with the position, from all measurements that are times.
+    wave_speed : float, str, (float, float), Layers, Atmosphere or Wind
+        Wave speed: m/s; a text such as "1480 m/s", "343+-5 m/s", "air:20C", "air:20C,50%" (humid), "water:8C,35,50m"
+        (salinity, depth), or the file of a profile; a pair of a speed and its standard deviation; or a medium of
+        `optloc.models`, in which rays bend or the wind carries the wave. By default light. A speed with a standard
+        deviation is estimated with the position, from all measurements that are times.
     method : str
         Method as in `optloc.solve`.
+    speed : float, str, (float, float), Layers or Atmosphere
+        Old name of `wave_speed`.
 
     Returns
     -------
@@ -238,15 +246,17 @@ def locate(
             raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
     north = _North(azimuth, declination)
     _check_north(north, given)
-    through, speed_sigma = _speed(speed), _speed_sigma(speed)
-    problem, labels = _problem_of(
-        stations, latlon, given, sigma, unit, reference, height, constraints, frame, through, speed_sigma, north
-    )
-    refuse_impossible(problem, lambda _: "ranges", "python")
-    fix = solve(problem, method=method)
+    wave = wave_of(renamed("speed", speed, "wave_speed", wave_speed))
+    floors = _floors(height)
+    made = [
+        _problem_of(stations, latlon, given, sigma, unit, reference, level, constraints, frame, wave, north)
+        for level in floors or [height]
+    ]
+    refuse_impossible(made[0][0], lambda _: "ranges", "python")
+    fix = solve_on_floors([problem for problem, _ in made], method) if floors else solve(made[0][0], method=method)
     if (np.asarray(fix.code) != Status.OK).any():  # values of another unit fit no position, so these checks may wait
-        warn_of_values(problem, unit, "toa" in given, through)
-    return _labelled(fix, labels)
+        warn_of_values(made[0][0], unit, "toa" in given, wave.speed)
+    return _labelled(fix, made[0][1])
 
 
 def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
@@ -273,35 +283,6 @@ def _check_north(north: _North, given: Mapping[str, Any]) -> None:
         raise InvalidProblem("there are no bearings", "declination", "remove this argument")
 
 
-def _speed_sigma(given: Any) -> float | None:
-    """Return the standard deviation, m/s, of a speed that is a pair; else None."""
-    return float(in_si(given[1], "speed", "speed")) if isinstance(given, tuple | list) else None
-
-
-def _speed(given: Any) -> float | Medium:
-    """Return the propagation speed, m/s, or the medium, from the argument `speed` of `locate`.
-
-    Raise InvalidProblem for a value that is not positive, or for a tuple without exactly two numbers.
-    """
-    if isinstance(given, Medium):
-        return given
-    if isinstance(given, tuple | list):
-        if len(given) != _PAIR:
-            raise InvalidProblem(
-                f"the speed has {len(given)} numbers", "speed", "give (speed, sigma), such as (343, 5)"
-            )
-        _speed(given[1])  # the standard deviation must be positive as well
-        return _speed(given[0])
-    try:
-        given = in_si(given, "speed", "speed")
-    except InvalidProblem as error:
-        raise InvalidProblem(error.what, "speed", f"{error.advice}, or give optloc.models.Layers") from None
-    if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
-        advice = "give metres per second, optloc.models.Layers or optloc.models.Atmosphere"
-        raise InvalidProblem("the speed is not a positive number", "speed", advice)
-    return float(given)
-
-
 def _texts(unit: Any) -> list[tuple[str, Any]]:
     """Return pairs of name and value that must be text, for a unit or a mapping of units."""
     return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
@@ -317,17 +298,15 @@ def _problem_of(
     height: Any,
     limits: StatedConstraints,
     frame: str,
-    through: float | Medium,
-    speed_sigma: float | None,
+    wave: Wave,
     north: _North,
 ) -> tuple[Problem, list[Any] | None]:
     """Return the problem of the arguments of `locate`, and the labels of its rows; None without labels.
 
-    `given` has the measurements by the name of their argument. `through` is the propagation speed, m/s, or the medium.
-    `speed_sigma` is the standard deviation of the speed, m/s; None for an exact speed. `north` is the zero direction of
-    bearings. The other parameters are arguments of `locate`.
+    `given` has the measurements by the name of their argument. `wave` is the wave that converts times to lengths.
+    `north` is the zero direction of bearings. The other parameters are arguments of `locate`.
     """
-    medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
+    speed = wave.speed
     places = _PLACES.call(_receivers, stations, latlon, frame)
     rows, timed, labels = [], [], None
     for word, values in given.items():
@@ -336,23 +315,13 @@ def _problem_of(
         value_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
         step, sigma_si = _SCALES.call(_scale, word, value_unit, sigma, list(given), speed, convention)
-        made = _rows(word, found, sigma_si, step, places, speed)
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
+        made = _rows(word, found, sigma_si, step, places, wave, timed=timed[-1])
         rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
-    found, motions = _constraints(height, limits, places, given, speed)
-    problem = assemble(places.stations, *rows, frame=places.frame, constraints=found, motions=motions, medium=medium)
-    return (problem if speed_sigma is None else _with_speed(problem, speed, speed_sigma, timed)), labels
-
-
-def _with_speed(problem: Problem, speed: float, sigma: float, timed: Sequence[bool]) -> Problem:
-    """Return a problem in which the propagation speed is unknown, as a scale bias of all rows that are times.
-
-    `speed` and `sigma` are the mean and the standard deviation of the speed, m/s. `timed` is whether each group of rows
-    has times.
-    """
-    ends = [(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
-    times = [np.arange(*end) for end, time in zip(ends, timed, strict=True) if time]
-    return replace(problem, biases=(*problem.biases, scale_of(speed, sigma, times, "speed")))
+    stated, motions = _constraints(height, limits, places, given, speed)
+    medium = wave.medium
+    problem = assemble(places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, medium=medium)
+    return with_speed(problem, wave, timed), labels
 
 
 def _scale(
@@ -367,9 +336,6 @@ def _scale(
     step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
     return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
-
-# Length of a speed with its standard deviation.
-_PAIR = 2
 
 # Receivers.
 
@@ -404,7 +370,7 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
 
 def _constraints(
     height: Any, limits: StatedConstraints, places: _Receivers, given: Mapping[str, Any], speed: float
-) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
     """Return the constraints of the target, and its motion.
 
     `height` and `limits` are the arguments `height` and `constraints` of `locate`. `given` has the measurements by
@@ -415,7 +381,7 @@ def _constraints(
     if not demands:
         return _heights(height, places, given), still
 
-    def found(more: dict[str, Any]) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+    def found(more: dict[str, Any]) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
         """Return the stated constraints together with `more`."""
         return constraints_of(demands | more, places.stations, places.frame, still, ("target",), np.zeros(1), speed)
 
@@ -425,6 +391,16 @@ def _constraints(
     if height is None and level:
         return stated, motions
     return found({"height": _heights(height, places, given)})
+
+
+def _floors(height: Any) -> list[Any]:
+    """Return the floors of the argument `height`: the heights of a set, or of a list of three or more; else none."""
+    several = isinstance(height, set | frozenset) or (isinstance(height, list | tuple) and len(height) > _BAND)
+    if not several:
+        return []
+    if not height:
+        raise InvalidProblem("there are no heights", "height", "give the heights of the floors, such as {0.0, 3.5}")
+    return sorted(height, key=str) if any(isinstance(each, str) for each in height) else sorted(height)
 
 
 def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
@@ -507,26 +483,27 @@ def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
 
 
 def _rows(
-    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, speed: float
+    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, wave: Wave, *, timed: bool
 ) -> Measured:
     """Return measurements in SI units as rows; missing values have the weight 0.
 
-    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `speed` the
-    propagation speed, m/s. Raise InvalidProblem for infinite values, or for times in a wrong unit.
+    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `wave` the wave
+    of the call. `timed` is whether the values are times. Raise InvalidProblem for infinite values, or for times in a
+    wrong unit.
     """
     kind = ARGUMENTS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T  # b is -1 except for time differences
     values = found.values
     if word == "toa":
         # Dates always become seconds, independent of the unit of sigma.
-        unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
+        unit = conversion("s", "length", propagation_speed=wave.speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
     z = np.asarray(unit.to_si(values), dtype=float)
     present = np.isfinite(z)
     if np.isinf(z).any():
         raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
-    if word in ("toa", "tdoa"):
-        _check_time_unit(word, z, sigma, places)
+    if timed or word in ("toa", "tdoa"):
+        check_times(word, z, sigma, places.extent, wave)
     columns = {"weight": present.astype(float), "a": a, "b": None if word != "tdoa" else b}
     # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
     # form loops, this is the cautious choice: a difference that follows from others adds no information.
@@ -574,15 +551,3 @@ def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
         advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times relative to a recent time"
         raise InvalidProblem(what, "toa", advice)
     return counted
-
-
-def _check_time_unit(word: str, z: Array, sigma: float, places: _Receivers) -> None:
-    """Raise InvalidProblem for times that are much longer than the paths between stations: their unit is wrong.
-
-    `z` (..., m) are the times as lengths, m, and `sigma` is their standard deviation, m. The limit is 100 times the
-    greater of the extent of the stations and `sigma`.
-    """
-    most = float(np.fmax.reduce(np.abs(z), axis=None, initial=0.0))
-    if most > _TOO_FAR * max(places.extent, sigma):
-        what = f"the arrivals are {most / 1e3:.3g} km apart, but the stations {places.extent / 1e3:.3g} km"
-        raise InvalidProblem(what, word, "state the unit of the times, such as unit='ns', or correct them")

@@ -13,7 +13,6 @@ from optloc.base.types import Array
 from optloc.base.units import conversion
 from optloc.files.measurements import RowChunk
 from optloc.model_checks.plausibility import refuse_impossible, suspicious_values, wrapped_times
-from optloc.models.medium import Medium
 from optloc.problem.problem import Problem
 
 
@@ -50,13 +49,11 @@ def _wraps(chunks: Sequence[RowChunk]) -> Iterator[str]:
             yield f"the times of {chunk.table.source} start again after {name}; add the period to the later rows"
 
 
-def warn_of_values(problem: Problem, unit: Any, timed: bool, through: float | Medium) -> None:
+def warn_of_values(problem: Problem, unit: Any, timed: bool, speed: float) -> None:
     """Warn the caller of `locate` about values that are physically suspicious.
 
-    `unit` is its argument. `timed` is whether there are times of arrival. `through` is the propagation speed, m/s, or
-    the medium.
+    `unit` is its argument. `timed` is whether there are times of arrival. `speed` is the wave speed, m/s.
     """
-    speed = through.unit_speed if isinstance(through, Medium) else through
     unit_of_times = unit if unit is None or isinstance(unit, str) else unit.get("toa")
     step = conversion(unit_of_times or "s", "length", propagation_speed=speed).factor if timed else 0.0
     for one in suspicious_values(problem, "python", units={"toa": step} if timed else {}, speed=speed):

@@ -34,7 +34,8 @@ def medium_in(
     """
     stated = _stated(file, source)
     if file.wind is None:
-        return None if file.medium is None else _medium(file.medium, None if stated is None else stated.speed, source)
+        reference = None if stated is None else stated.speed
+        return None if file.medium is None else medium_of(file.medium, reference, join(source, "[medium]"))
     place = join(source, "key 'wind'")
     if file.medium is not None:
         raise InvalidProblem("a wind needs one wave speed, and the file has [medium]", place, "remove one of them")
@@ -72,13 +73,12 @@ def speed_words(file: ProblemFile, source: str) -> str:
     return f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)" if stated is None else stated.words
 
 
-def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
+def medium_of(table: MediumTable, reference: float | None, place: str) -> Medium:
     """Return the medium of a table; raise InvalidProblem for missing or superfluous keys.
 
     `reference` is the propagation speed of the file, m/s; None if it states none. It converts times to lengths in
-    layers.
+    layers. `place` is the place for messages.
     """
-    place = join(source, "[medium]")
     permitted_keys = _MEDIA[table.kind]
     given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
     wrong, lacking = (
@@ -206,13 +206,24 @@ def check_speed(
         if chunk.units.quantity != "length":
             continue
         longest, noise = _longest(chunk, group), _noise(chunk)
-        speed = SPEED_OF_LIGHT * extent / longest if longest > 0.0 else np.inf
-        if _SLOWEST < speed < _FASTEST or noise > _USELESS * extent:
+        if fits_sound(longest, noise, extent):
             what = f"light travels {max(longest, noise) / 1e3:.3g} km in these times, and no wave speed is stated"
             advice = 'state it: --wave-speed air:20C, or propagation_speed = "air:20C" in a file; or correct the unit'
             if source == "arguments":
                 advice = 'state it, such as wave_speed="air:20C", or correct the unit'
             raise InvalidProblem(what, chunk.table.source, advice)
+
+
+def fits_sound(longest: float, noise: float, extent: float) -> bool:
+    """Return whether times make sense as times of sound, and not as times of light.
+
+    `longest` is the longest path, `noise` the least standard deviation, and `extent` the size of the network, all in
+    metres at the speed of light.
+    """
+    if not extent > 0.0:
+        return False
+    product = SPEED_OF_LIGHT * extent
+    return _SLOWEST * longest < product and (product < _FASTEST * longest or noise > _USELESS * extent)
 
 
 def _longest(chunk: RowChunk, group: Array) -> float:

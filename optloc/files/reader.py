@@ -97,6 +97,8 @@ class Loaded:
         Sentences on values that are physically suspicious.
     speed : str
         Wave speed, as text; empty if no value depends on it.
+    floors : tuple of float
+        Heights, metres, on one of which the target is; empty without such a list.
     """
 
     problem: Problem
@@ -112,6 +114,7 @@ class Loaded:
     table: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     speed: str = ""
+    floors: tuple[float, ...] = ()
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""

@@ -169,7 +169,7 @@ class ColumnHints:
     system: str | None = None
     mask: str | None = None
     turned: bool = False
-    wave: WaveOptions = WaveOptions()
+    wave: WaveOptions = field(default_factory=WaveOptions)
     height: str | None = None
 
 

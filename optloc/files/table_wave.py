@@ -65,8 +65,8 @@ def _two_way(sections: tuple[Section, ...], wave: WaveOptions) -> tuple[Section,
         kinds = " and ".join(dict.fromkeys(section.kind for section in sections))
         advice = "add --as range if they are times of the way there and back, or remove this option"
         raise InvalidProblem(f"the table has {kinds}, not ranges as times", "--two-way", advice)
-    more = ("two_way = true",)
-    more += (f"turn_around = {json.dumps(wave.turn_around)}",) if wave.turn_around is not None else ()
+    more = ["two_way = true"]
+    more += [f"turn_around = {json.dumps(wave.turn_around)}"] if wave.turn_around is not None else []
     return tuple(
         replace(section, lines=(*section.lines, *more)) if two_way else section
         for section, two_way in zip(sections, chosen, strict=True)

@@ -207,10 +207,7 @@ def profile_of(path: str, where: str, folder: Path | None = None) -> MediumTable
     table = read_table(Path(path)) if folder is None else table_of(DataTable(file=path), folder, where)
     level, speed = _column(table, (*_DEPTHS, *_HEIGHTS), "depth_m"), _column(table, _SPEEDS, "speed_m_s")
     down = 1.0 if stem(level) in _DEPTHS else -1.0
-    depth, speeds = (
-        _in_si(table, name, quantity)
-        for name, quantity in ((level, "length"), (speed, "speed"))  # type: ignore[arg-type]
-    )
+    depth, speeds = _in_si(table, level, "length"), _in_si(table, speed, "speed")
     order = np.argsort(down * depth, kind="stable")
     return MediumTable(kind="layers", depths=(down * depth)[order].tolist(), speeds=speeds[order].tolist())
 
@@ -307,7 +304,8 @@ def wind_of(given: str | Sequence[float], where: str) -> tuple[float, ...]:
             raise InvalidProblem(f"{given!r} is not a wind", where, advice)
         size = float(Units("speed").conversion(strength[2], where).to_si(float(strength[1])))
         turn = np.radians(float(bearing[1]))
-        return float(-size * np.sin(turn)), float(-size * np.cos(turn))
+        # a wind from the west has no exact zero towards the north; the last digits of a sine have no meaning
+        return tuple(round(float(-size * part), 12) + 0.0 for part in (np.sin(turn), np.cos(turn)))
     try:
         parts = tuple(float(part) for part in given.split(","))
     except ValueError:

@@ -123,11 +123,13 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     # Omit default values, so that they stay defaults.
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
-    kept = (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values())
+    targets = (settings.get("target", {}), *settings.get("targets", {}).values())
+    kept = {"stations": settings["stations"], **{f"target-{i + 1}": each for i, each in enumerate(targets)}}
+    kept |= {f"constraint-{i + 1}": each for i, each in enumerate(settings.get("constraints", []))}
     copies: dict[Path, Path] = {}
-    for i, section in enumerate(kept):
+    for role, section in kept.items():
         if "file" in section:
-            copies |= _relocate(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
+            copies |= _relocate(section, source.parent, out, role)
     tables = [out.with_name(f"{out.stem}-{i + 1}.csv") for i in range(len(made.tables))]
     claim(out, *copies, *tables, inputs=[source])
     with replace_together():

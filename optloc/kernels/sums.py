@@ -111,7 +111,8 @@ def is_run(problem: Problem) -> bool:
 
 def serves(problem: Problem, starts: int) -> bool:
     """Return whether machine code supports a problem, and exists or may be compiled, for `starts` vectors."""
-    if not starts or not enabled() or walks(problem):
+    # the kernels have no code for fences
+    if not starts or not enabled() or walks(problem) or problem.fences:
         return False
     from optloc.kernels.equations import normal_block
     from optloc.kernels.refine import refine_block

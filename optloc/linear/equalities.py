@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.linalg import tangent
 from optloc.base.types import Array, Band, Constraint
-from optloc.linear.constraints import Face, exact, levels, restore, tangent_at
+from optloc.linear.constraints import Face, exact, kind_of, levels, restore, tangent_at
 from optloc.linear.normal import Normal, marginal, step
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.epochs import states_by_epoch
@@ -79,6 +79,9 @@ class Equalities:
             Vectors before the steps.
         """
         along = tangent_at(self.problem, self.lasting, x) if self.lasting else None
+        if along is not None and is_bent(self.problem, self.lasting):
+            bend = bend_along(self.problem, self.lasting, equations, along, x)
+            equations = replace(equations, shared=equations.shared + bend)
         if self.single is None:
             return step(equations, damping, along)
         # the local unknowns of these equations are coefficients of a basis of the steps that stay on the equalities
@@ -147,6 +150,68 @@ class Equalities:
         for here, there in self._slots():
             local[:, here] = states[:, there]
         return np.concatenate([shared, local.reshape(len(x), -1)], axis=1)
+
+
+# Share of a curvature that must be left after the bend of the equalities: with less, the quadratic model says nothing.
+_LEFT = 0.05
+# Step of differences, relative to one plus a coordinate.
+_STEP = 1e-5
+
+
+def is_bent(problem: Problem, face: Face) -> bool:
+    """Return whether a level of a face has a curvature that matters; that of the Earth does not."""
+    return any(kind_of(problem, level) not in ("plane", "height") for level in face)
+
+
+def bend_along(problem: Problem, face: Face, equations: Normal, along: Array, x: Array) -> Array:
+    """Return the curvature (M, n, n) that bent equalities add to the cost along their tangent space.
+
+    On a surface g = 0 the cost has the second derivative of the function of Lagrange: that of the cost plus the
+    multiplier times that of g. Steps with it converge in a few iterations. Where the sum is not positive, the result is
+    zero, as in the method of Gauss and Newton.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of M problems.
+    face : Face
+        The equalities.
+    equations : Normal
+        Normal equations at `x`.
+    along : array (M, n, n - c)
+        Basis of the tangent space.
+    x : array (M, size)
+        Vectors on the face.
+
+    References
+    ----------
+    J. Nocedal, S. J. Wright, "Numerical Optimization" (2006), section 12.5.
+    """
+    information, vector, _ = marginal(equations)
+    gradients, n = levels(problem, face, x)[1], information.shape[-1]
+    with np.errstate(all="ignore"):
+        # minus the gradient is a combination of the normals
+        share = (np.linalg.pinv(np.swapaxes(np.nan_to_num(gradients), -1, -2)) @ vector[..., None])[..., 0]
+        bend = np.zeros_like(information)
+        for j in np.flatnonzero((gradients != 0.0).any((0, 1))):
+            size = _STEP * (1.0 + np.abs(x[:, j]))
+            moved = [x + np.where(np.arange(x.shape[1]) == j, sign * size[:, None], 0.0) for sign in (1.0, -1.0)]
+            slope = (levels(problem, face, moved[0])[1] - levels(problem, face, moved[1])[1]) / (
+                2.0 * size[:, None, None]
+            )
+            bend[:, :, j] = (share[..., None] * slope).sum(1)
+        bend = 0.5 * (bend + np.swapaxes(bend, -1, -2))
+        inner = np.swapaxes(along, -1, -2) @ bend @ along
+        flat = np.swapaxes(along, -1, -2) @ information @ along
+        good = np.isfinite(inner).all((-1, -2)) & np.isfinite(flat).all((-1, -2))
+        if not inner.shape[-1] or not n:
+            return np.zeros_like(information)
+        eye = np.eye(inner.shape[-1])
+        both = np.where(good[:, None, None], flat + inner - _LEFT * flat, eye)
+        good &= np.linalg.eigvalsh(both)[:, 0] > 0.0
+        added = along @ inner @ np.swapaxes(along, -1, -2)
+        good &= (np.diagonal(equations.shared + added, axis1=-2, axis2=-1) > 0.0).all(-1)
+    return np.where(good[:, None, None], added, 0.0)
 
 
 def spare_rows(problem: Problem) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from optloc.base.arrays import as_array_like, as_number, eye, gather, library
 from optloc.base.types import Array, Rows
 from optloc.linear import chain
 from optloc.linear.evaluate import differentiate
+from optloc.linear.fences import fence_terms
 from optloc.linear.walks import chain_at, walks
 from optloc.models import MODELS
 from optloc.problem.forms import form_of
@@ -508,12 +510,12 @@ def decrement(equations: Normal, move: Array, layout_n: int) -> Array:
 
 
 def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool = True, local: bool = True) -> Normal:
-    """Return normal equations with the Gaussian priors of a problem added.
+    """Return normal equations with the Gaussian priors and the fences of a problem added.
 
     Parameters
     ----------
     problem : Problem
-        Priors on named unknowns, biases and station positions.
+        Priors on named unknowns, biases and station positions; and fences.
     x : array (..., size)
         Vectors at which the problem was linearised.
     equations : Normal
@@ -522,35 +524,38 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
         Whether to add the priors of shared unknowns, and the priors of local unknowns.
     """
     layout = problem.layout
-    parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
+    terms: list[tuple[str, Any]] = [
+        (name, partial(_gaussian, as_array_like(mean, x), as_array_like(precision, x)))
+        for name, mean, precision in prior_parts(problem)
+    ]
+    terms += [(fence.name, fence) for fence in fence_terms(problem, x)]
     if local and walks(problem):
         equations = _with_walks(problem, x, equations)
-    if not parts:
-        return equations
     (at_shared, at_local), xp = layout.split(x), library(x)
     matrix, vector, cost = equations.shared, equations.shared_vector, equations.cost
     blocks, local_vector = equations.local, equations.local_vector
-    for name, mean, precision in parts:
+    for name, term in terms:
         slot, is_shared = layout.find(name)
+        if not (shared if is_shared else local):
+            continue
         width = layout.n_shared if is_shared else layout.n_local
         # A product with columns of the unit matrix places a block: some libraries cannot write into an array.
-        pick = as_array_like(np.eye(width)[:, slot.start : slot.start + slot.size], x)
-        precision = as_array_like(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
-        error = (
-            as_array_like(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
-        )
-        pull = (precision @ error[..., None])[..., 0]
-        penalty = xp.sum(error * pull, axis=-1)
+        part = slice(slot.start, slot.start + slot.size)
+        pick = as_array_like(np.eye(width)[:, part], x)
+        precision, pull, penalty = term((at_shared if is_shared else at_local)[..., part])
+        block, right = pick @ precision @ pick.mT, (pick @ pull[..., None])[..., 0]
         if is_shared:
-            matrix, vector = matrix + pick @ precision @ pick.mT, vector + (pick @ pull[..., None])[..., 0]
-            cost = cost + penalty
+            matrix, vector, cost = matrix + block, vector + right, cost + penalty
         else:
-            blocks, local_vector = (
-                blocks + pick @ precision @ pick.mT,
-                local_vector + (pick @ pull[..., None])[..., 0],
-            )
+            blocks, local_vector = blocks + block, local_vector + right
             cost = cost + xp.sum(penalty, axis=-1)
     return Normal(matrix, blocks, equations.cross, vector, local_vector, cost, equations.link)
+
+
+def _gaussian(mean: Any, precision: Any, value: Any) -> tuple[Any, Any, Any]:
+    """Return precision, pull (..., q) and penalty (...) of a Gaussian prior at values (..., q) of its unknown."""
+    pull = (precision @ (mean - value)[..., None])[..., 0]
+    return precision, pull, library(value).sum((mean - value) * pull, axis=-1)
 
 
 def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:
@@ -585,16 +590,8 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
     stations = problem.stations
     for name, _, covariance in stations.errors if stations.unknown_for else ():
-        precision = _block_diagonal(linalg.inverse(covariance)[0])
+        precision = linalg.block_diagonal(linalg.inverse(covariance)[0])
         if stations.unknown_for == "epoch":
             precision = precision[..., None, :, :]
         parts.append((name, np.zeros(precision.shape[-1]), precision))
     return parts
-
-
-def _block_diagonal(blocks: Array) -> Array:
-    """Return blocks (..., s, d, d) as block-diagonal matrices (..., s d, s d)."""
-    s, d = blocks.shape[-3], blocks.shape[-1]
-    apart = as_array_like(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
-    whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
-    return whole

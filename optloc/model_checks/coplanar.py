@@ -149,7 +149,7 @@ def is_symmetric(problem: Problem) -> bool:
     """Return whether rows and priors are equal for mirror images of the target in a plane of all stations."""
     if not one_position(problem) or depends_on_place(problem) or problem.stations.errors:
         return False
-    if any(name == "position" for name, _, _ in prior_parts(problem)):
+    if problem.fences or any(name == "position" for name, _, _ in prior_parts(problem)):
         return False
     return problem.medium is None and all(is_of_ranges(rows.kind) for rows in problem.rows)
 

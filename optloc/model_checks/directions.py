@@ -546,7 +546,7 @@ def _with_range(
 def has_directions(problem: Problem) -> bool:
     """Return whether problems have one static position, no constraints and no medium, as `DirectionCost` requires."""
     still = one_position(problem) and problem.motions[0].order == 0 and problem.layout.shares("position")
-    return still and not problem.constraints and problem.medium is None
+    return still and not (problem.constraints or problem.fences) and problem.medium is None
 
 
 # Regions in the plane.

@@ -124,7 +124,7 @@ def _shape(problem: Problem) -> _Shape | None:
             return None
         present = weight[start : start + rows.count] > 0.0
         numbers |= {int(i) for index in (rows.a, rows.b)[: model.stations] for i in index[present]}
-    if len(numbers) < 2 or any(prior.name.startswith("position") for prior in problem.priors):
+    if len(numbers) < 2 or problem.fences or any(prior.name.startswith("position") for prior in problem.priors):
         return None
     places = problem.stations.position[..., sorted(numbers), :].reshape(-1, problem.dimension)
     centre, _ = centre_and_spread(places)

@@ -106,7 +106,7 @@ def cost_beyond_speed(problem: Problem, x: Array) -> Array:
     cost. `problem` is a flat batch of N problems with one position, and `x` (N, size) are fixes.
     """
     out, free = np.full(len(x), np.inf), _without_prior(problem)
-    if problem.constraints or not len(free):
+    if problem.constraints or problem.fences or not len(free):
         return out
     # `items` are the problems with coplanar stations; only their waves are paraboloids
     centre, normal, tangents, spread, items = _planes_of(problem, len(x))

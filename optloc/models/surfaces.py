@@ -46,7 +46,8 @@ class Surface:
         The bounds that leave a convex set of positions.
     around : callable of (c, bound), optional
         Function that returns points (q, k) spread over the surface on which the quantity equals `bound`: the first k
-        coordinates of positions, metres. None for a surface without bends.
+        coordinates of positions, metres. With a second target they are differences of positions. None for a surface
+        without bends.
     """
 
     g: Callable[[Point, Components], Any]
@@ -184,6 +185,11 @@ def _around_point(c: Components, bound: float) -> Array:
     return np.array(c) + bound * spread_directions(_AROUND[len(c)], len(c))
 
 
+def _around_origin(c: Components, bound: float) -> Array:
+    """Return vectors (q, 2) of the length `bound` in all directions of the plan, metres."""
+    return bound * spread_directions(_AROUND[2], 2)
+
+
 def _around_segment(c: Components, bound: float) -> Array:
     """Return points (q, k) at the distance `bound` around the segment `c`, metres: around its ends and along it."""
     half = len(c) // 2
@@ -250,9 +256,16 @@ _OWN: dict[str, Surface] = {
     "terrain": Surface(
         _terrain, "height above the ground of a grid", "m", table=True, upright=True, around=_around_terrain
     ),
-    "separation": Surface(_separation, "distance between two targets", "m", other=True, ends=True),
+    "separation": Surface(
+        _separation, "distance between two targets", "m", other=True, ends=True, around=_around_origin
+    ),
     "least separation": Surface(
-        _least_separation, "least distance between two targets within the run", "m", other=True, along=True
+        _least_separation,
+        "least distance between two targets within the run",
+        "m",
+        other=True,
+        along=True,
+        around=_around_origin,
     ),
 }
 

@@ -197,6 +197,7 @@ def _check(problem: Problem) -> None:
         ("biases", problem.biases),
         ("priors", problem.priors),
         ("constraints", problem.constraints),
+        ("fences", problem.fences),
         ("stations", bool(problem.stations.errors)),
     ):
         if given:

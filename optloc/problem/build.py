@@ -17,7 +17,7 @@ from optloc.base.arrays import as_deviations, as_integers, numbers
 from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Amount, Amounts, Array, Bias, Constraint, Motion, Prior, Rows, Stations, Whole
+from optloc.base.types import Amount, Amounts, Array, Bias, Constraint, Fence, Motion, Prior, Rows, Stations, Whole
 from optloc.base.units import Quantity, in_si
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
@@ -257,7 +257,7 @@ def assemble(
     priors: Sequence[Prior] = (),
     frame: Frame = CARTESIAN,
     covariance: ArrayLike | None = None,
-    constraints: Sequence[Constraint | Sequence[Constraint]] = (),
+    constraints: Sequence[Constraint | Fence | Sequence[Constraint | Fence]] = (),
     medium: Medium | None = None,
 ) -> Problem:
     """Return a problem, or a batch of problems if the arrays have leading axes.
@@ -280,8 +280,8 @@ def assemble(
         Coordinate frame.
     covariance : array (..., m, m), optional
         Joint covariance of all rows, across kinds. It replaces the noise of the measurements.
-    constraints : sequence of Band, Polygon, AnyOf or tuples of them
-        Conditions that the answer must meet, see `optloc.linear.constraints`.
+    constraints : sequence of Band, Polygon, AnyOf, Fence or tuples of them
+        Conditions that the answer must meet, see `optloc.constraints`. A `Fence` is a term of the cost instead.
     medium : Layers or Atmosphere, optional
         Medium of the waves if their speed is not constant. Rows are then measured along rays of the medium.
 
@@ -349,8 +349,8 @@ def _key(problem: Problem, measurements: Sequence[Measured], joint: Array | None
     """
     rows = [(r.kind, r.z.shape, r.a, r.b, r.epoch, r.target, r.weight, r.correction) for r in problem.rows]
     noise = [(m.variance, m.arrival, m.covariance, m.signal) for m in measurements]
-    rest = (problem.times, problem.motions, problem.biases, problem.priors, problem.frame, problem.constraints)
-    return key_of(problem.stations, rows, noise, joint, rest, medium)
+    stated = (problem.motions, problem.biases, problem.priors, problem.constraints, problem.fences)
+    return key_of(problem.stations, rows, noise, joint, (problem.times, problem.frame, *stated), medium)
 
 
 def _template(problem: Problem) -> _Template:

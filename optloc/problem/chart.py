@@ -32,6 +32,9 @@ NAMES = ("cartesian", "inverse range", "curved")
 TRUNCATED = "truncated"
 """Name of a Cartesian chart if bounds truncate the distribution."""
 
+# Standard deviations from a fence beyond which it removes a probability below 1e-9.
+_FAR_INSIDE = 6.0
+
 Extent = Literal["range", "bearing", "elevation", "height", "x", "y", "z"]
 
 # The advice names a function, because a module of a higher layer computes the region.
@@ -166,6 +169,43 @@ def tail_probability(cost: Array, dof: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
+class Skew:
+    """Laws of positions that J uncertain fences make asymmetric: a Gaussian times the probability of each fence.
+
+    Parameters
+    ----------
+    margin : array (..., J)
+        Margins of the fixes, in standard deviations of the fences; infinite for unused entries.
+    slope : array (..., J, d)
+        Decrease of the margins with the position, per metre.
+    shift : array (..., d)
+        Mean of the Gaussian minus the fix, metres.
+    covariance : array (..., d, d)
+        Covariance of the Gaussian, square metres.
+    """
+
+    margin: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
+    slope: Annotated[Array, Axes(2, slots=True, empty=0.0)]
+    shift: Annotated[Array, Axes(1, empty=0.0)]
+    covariance: Annotated[Array, Axes(2)]
+
+    @property
+    def matters(self) -> Array:
+        """Return a mask (...) of the fixes whose law a fence changes, if the law is known."""
+        # margin at the mean of the Gaussian, and its standard deviation with the error of the fence
+        mean = self.margin - (self.slope * self.shift[..., None, :]).sum(-1)
+        variance = ((self.slope[..., :, None, :] * self.covariance[..., None, :, :]).sum(-1) * self.slope).sum(-1)
+        near = mean < _FAR_INSIDE * np.sqrt(1.0 + variance)
+        return np.asarray(near.any(-1) & np.isfinite(self.covariance).all((-1, -2)))
+
+    def probability(self, points: Array) -> Array:
+        """Return the probability (p,) that points (p, d), metres from one fix, are inside all fences."""
+        from scipy.special import ndtr
+
+        return np.asarray(ndtr(self.margin - (points[:, None] * self.slope).sum(-1)).prod(-1))
+
+
+@dataclass(frozen=True, slots=True)
 class Chart:
     """Coordinates in which the errors of fixes are Gaussian, with the parameters of the distribution.
 
@@ -185,6 +225,8 @@ class Chart:
     inflation : array (...), optional
         Factors by which trackers multiply the covariances when they start from the fixes: above 1 for fixes with the
         finding `tails`, otherwise 1.
+    skew : Skew, optional
+        Laws that uncertain fences make asymmetric; `covariance` is then the mean squared error about the fix.
     """
 
     kind: Annotated[Array, Axes(0, empty=CURVED)]
@@ -193,6 +235,7 @@ class Chart:
     centre: Annotated[Array, Axes(1)]
     truncated: Truncated | None = None
     inflation: Annotated[Array, Axes(0, empty=1.0)] | None = None
+    skew: Skew | None = None
 
     @property
     def name(self) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import AnyOf, Array, Band, Constraint, Motion, Polygon
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Motion, Polygon
 from optloc.base.units import LARGEST
 from optloc.models.surfaces import SURFACES, Surface
 from optloc.problem.epochs import separable
@@ -34,7 +34,7 @@ _SLIVER = 1e-12
 
 def check_constraints(problem: Problem) -> None:
     """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status."""
-    for constraint in problem.constraints:
+    for constraint in (*problem.constraints, *problem.fences):
         where = f"constraint {constraint.name!r}"
         _check_target(problem, constraint, where)
         if isinstance(constraint, Polygon):
@@ -42,13 +42,15 @@ def check_constraints(problem: Problem) -> None:
             check_polygon(constraint.vertices, where)
         elif isinstance(constraint, AnyOf):
             _check_union(problem, constraint, where)
-        else:
+        elif isinstance(constraint, Band):
             _check_band(problem, constraint, where)
+        elif constraint.normal.shape[-1] != problem.dimension:
+            raise InvalidProblem("the normal has another dimension than the stations", where, "match the stations")
     for same in bands_by_quantity(problem.constraints):
         _check_agreement(same)
 
 
-def _check_target(problem: Problem, constraint: Constraint, where: str) -> None:
+def _check_target(problem: Problem, constraint: Constraint | Fence, where: str) -> None:
     """Raise if the target of a constraint is missing or known, or if other unknowns connect its free epochs."""
     count = len(problem.motions)
     if not 0 <= constraint.target < count:

@@ -128,17 +128,13 @@ def states_by_epoch(problem: Problem) -> Problem:
         replace(p, mean=_add_epoch_axis(p.mean, 1), covariance=_add_epoch_axis(p.covariance, 2)) for p in problem.priors
     )
     constraints = tuple(_spread_constraint(c, problem.motions[c.target].rise) for c in problem.constraints)
-    return replace(
-        problem,
-        stations=stations,
-        rows=(),
-        noise=Noise(()),
-        biases=(),
-        times=np.zeros(1),
-        motions=motions,
-        priors=priors,
-        constraints=constraints,
+    spread = _add_epoch_axis
+    fences = tuple(
+        replace(f, normal=spread(f.normal, 1), offset=spread(f.offset, 0), sigma=spread(f.sigma, 0))
+        for f in problem.fences
     )
+    bare = replace(problem, rows=(), noise=Noise(()), biases=(), times=np.zeros(1))
+    return replace(bare, stations=stations, motions=motions, priors=priors, constraints=constraints, fences=fences)
 
 
 def _spread_constraint(c: Constraint, rise: Array | None) -> Constraint:

@@ -15,7 +15,20 @@ import numpy as np
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import AnyOf, Array, Band, Bias, CompassRows, Constraint, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.types import (
+    AnyOf,
+    Array,
+    Band,
+    Bias,
+    CompassRows,
+    Constraint,
+    Fence,
+    Motion,
+    Polygon,
+    Prior,
+    Rows,
+    Stations,
+)
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium, Wind
@@ -47,9 +60,11 @@ class Problem:
     frame : Frame
         Coordinate frame.
     constraints : tuple of Band, Polygon or AnyOf
-        Conditions that the answer must meet.
+        Conditions that the answer must meet. A `Fence` among them becomes a member of `fences`.
     medium : Layers or Atmosphere, optional
         Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
+    fences : tuple of Fence
+        Uncertain half-planes, which are terms of the cost.
     """
 
     stations: Stations
@@ -62,6 +77,16 @@ class Problem:
     frame: Frame = CARTESIAN
     constraints: tuple[Constraint, ...] = ()
     medium: Medium | None = None
+    fences: tuple[Fence, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Move fences from the constraints to `fences`: users state both in one list."""
+        given: tuple[Any, ...] = self.constraints
+        stated = tuple(c for c in given if isinstance(c, Fence))
+        if stated:
+            kept = tuple(c for c in given if not isinstance(c, Fence))
+            object.__setattr__(self, "constraints", kept)
+            object.__setattr__(self, "fences", (*self.fences, *stated))
 
     @property
     def dimension(self) -> int:
@@ -168,8 +193,10 @@ class Problem:
         # Polygons are not part of the key: cached programs depend on the bands of their edges, which their keys
         # contain.
         constraints = tuple(_constraint_key(c, self.motions) for c in self.constraints if not isinstance(c, Polygon))
-        medium = () if self.medium is None else (self.medium,)
-        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
+        medium: tuple[Any, ...] = () if self.medium is None else (self.medium,)
+        fences = (("fences", *(fence.target for fence in self.fences)),) if self.fences else ()
+        found = (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
+        return (*found, *medium, *fences)
 
     def in_medium(self, medium: Medium) -> Problem:
         """Return the problem with its rows measured along the rays of a medium. All positions stay.
@@ -349,6 +376,7 @@ _NUMBERS: dict[type, dict[str, int]] = {
     Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},
     Band: {"lower": 0, "upper": 0, "coefficients": 1},
+    Fence: {"normal": 1, "offset": 0, "sigma": 0},
     Polygon: {},
 }
 
@@ -370,7 +398,8 @@ def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     """Return each numeric array of a problem, with its rank without batch axes."""
     blocks = problem.noise.blocks
     limits = tuple(part for constraint in problem.constraints for part in _parts(constraint))
-    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *limits)
+    stated = (*problem.motions, *problem.priors, *limits, *problem.fences)
+    parts = (problem.stations, *problem.rows, *blocks, *stated)
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
@@ -398,6 +427,7 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
         motions=each(problem.motions),
         priors=each(problem.priors),
         constraints=each(problem.constraints),
+        fences=each(problem.fences),
     )
 
 

@@ -32,6 +32,8 @@ _RAYS = {2: 360, 3: 2500}
 _NODES, _END = 16, 45.0
 # Number of nodes on a ray for sorted values, and the share by which they shift from ray to ray (golden section).
 _SPREAD, _GOLDEN = 48, 0.6180339887498949
+# Numbers of rays and of nodes on a ray, by dimension, for the probability of any region: the error is below 0.001.
+_FINE = {1: (2, 2**15), 2: (720, 96), 3: (2500, 96)}
 # Number of thresholds in the table of enclosed probability, between which it is interpolated.
 _LEVELS = 96
 # Number of candidate intervals among which the shortest is selected.
@@ -191,6 +193,15 @@ class Truncated:
         away = (points - self.shift) @ rays.whitener.T
         return points, (away**2).sum(-1) - (rays.middle**2).sum()
 
+    def nodes(self) -> tuple[Array, Array]:
+        """Return fixed points (p, d) of one distribution, metres from the fix, and weights (p,), not normalised."""
+        rank = factor_of(self.covariance).shape[1]
+        if not rank:  # an exact position
+            return np.zeros((1, len(self.shift))), np.ones(1)
+        count, nodes = _FINE[rank]
+        points, weight = self._rays(count).spread(nodes)
+        return points.reshape(-1, points.shape[-1]), weight.ravel()
+
     def outline(self, plane: Array, level: float) -> Array:
         """Return the closed boundary (r, 2) of the highest-density region in a plane, metres from the fix.
 
@@ -215,12 +226,15 @@ class Truncated:
         boundary = points if plane.shape[1] == 2 else points[ConvexHull(points).vertices]
         return np.concatenate([boundary, boundary[:1]])
 
-    def _rays(self) -> _Rays:
-        """Return one distribution in polar coordinates around its fix, with quadrature nodes on each ray."""
+    def _rays(self, count: int | None = None) -> _Rays:
+        """Return one distribution in polar coordinates around its fix, with quadrature nodes on each ray.
+
+        `count` is the number of rays; None for the number of moments and regions.
+        """
         factor = factor_of(self.covariance)
         rank = factor.shape[1]
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
-        unit, middle = _directions(rank), whitener @ self.shift
+        unit, middle = _directions(rank, count or _RAYS.get(rank, 2)), whitener @ self.shift
         step, lean = unit @ factor.T, unit @ middle
         # A ray ends where the squared deviation has increased by `_END`.
         length = np.minimum(self.exits(step), lean + np.sqrt(lean**2 + _END))
@@ -279,14 +293,16 @@ class _Rays(NamedTuple):
     tip: Array
     weight: Array
 
-    def spread(self) -> tuple[Array, Array]:
+    def spread(self, nodes: int = _SPREAD) -> tuple[Array, Array]:
         """Return other nodes (k, n, d), metres from the fix, and their weights (k, n), at other lengths on each ray.
+
+        `nodes` is the number n of nodes on a ray.
 
         With the same lengths on all rays, values at the nodes form clusters, and the ends of a shortest interval would
         be between clusters.
         """
         k = np.arange(len(self.length))[:, None]
-        node = (np.arange(_SPREAD) + k * _GOLDEN % 1.0) / _SPREAD
+        node = (np.arange(nodes) + k * _GOLDEN % 1.0) / nodes
         weight = self.length[:, None] * _density(self.length[:, None] * node, self.lean[:, None], self.rank)
         return self.tip[:, None] * node[..., None], weight
 
@@ -364,6 +380,6 @@ def _gauss() -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=4)
-def _directions(rank: int) -> Array:
-    """Return evenly distributed unit vectors (k, rank), the directions of the rays."""
-    return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(_RAYS[rank], rank)
+def _directions(rank: int, count: int) -> Array:
+    """Return evenly distributed unit vectors (k, rank), the directions of the rays: `count`, or two on a line."""
+    return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(count, rank)

@@ -82,9 +82,8 @@ def _check_stations(problem: Problem) -> None:
         name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
         raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
     if len(stations.names) != stations.count:
-        raise InvalidProblem(
-            f"{stations.count} stations have {len(stations.names)} names", "stations", "give one name each"
-        )
+        what = f"{stations.count} stations have {len(stations.names)} names"
+        raise InvalidProblem(what, "stations", "give one name each")
     check_once(stations.names, "station name {!r} is used twice", "stations")
     if problem.frame.kind == "ecef" and stations.dimension != 3:
         raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
@@ -287,9 +286,8 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         return
     shape = motion.known.shape
     if len(shape) < 3 or shape[-1] != problem.dimension:
-        raise InvalidProblem(
-            f"the known states have shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
-        )
+        wanted = f"give (epochs or 1, order + 1, {problem.dimension})"
+        raise InvalidProblem(f"the known states have shape {shape}", where, wanted)
     if shape[-3] not in (1, problem.epochs):
         counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
         raise InvalidProblem(

@@ -18,6 +18,7 @@ from optloc.kernels.jit import enabled
 from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
+from optloc.models.medium import Wind
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.proof.position_costs import factors_of_rows, own_epochs
@@ -56,6 +57,8 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield from _reasons_against_scale(problem)
     yield from _reasons_against_stations(problem)
     yield from _reasons_against_constraints(problem)
+    if problem.fences:
+        yield f"{problem.fences[0].name!r} is an uncertain fence, whose cost the proof does not bound"
     known = {"position", "velocity", *(bias.name for bias in problem.biases)}
     known |= {name for name, _, _ in problem.stations.errors}
     # `optloc.proof.position_costs` writes priors on known names as rows. Other priors would silently be left out of
@@ -126,7 +129,8 @@ def _reasons_against_rows(problem: Problem) -> Iterator[str]:
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.straight is not None:
-            yield f"{model.straight} rows follow rays that bend, but the proof covers straight rays"
+            rays = "cross a wind" if isinstance(problem.medium, Wind) else "follow rays that bend"
+            yield f"{model.straight} rows {rays}, but the proof covers straight rays"
         elif model.ranges is None and not model.nodes:
             yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind with known bounds"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN

@@ -18,7 +18,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optloc.cli import READER_GONE, STOPPED, Budget, Force, Method, Outside, ProblemPath, Quiet, Verbose, example
+from optloc.cli import (
+    READER_GONE,
+    STOPPED,
+    Budget,
+    Force,
+    Height,
+    Method,
+    Outside,
+    ProblemPath,
+    Quiet,
+    Verbose,
+    WaveSpeed,
+    example,
+)
 from optloc.files import claim, visible
 from optloc.problem import InvalidProblem, nearest
 
@@ -134,6 +147,8 @@ def live(
     filter_: Filter = "iekf",
     noise: Noise = None,
     gap: Gap = None,
+    wave_speed: WaveSpeed = None,
+    height: Height = None,
     check: Annotated[bool, typer.Option("--check", help="Print the input format of the stream, and end.")] = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -146,14 +161,15 @@ def live(
     The rows of FILE are the template of an event. Signals: TERM answers all waiting events and ends, HUP reloads FILE.
     """
     if check:
-        raise typer.Exit(run_check(file, method))
+        raise typer.Exit(run_check(file, method, (wave_speed, height)))
     settings = _settings(wait, late, phases, deadline, part, form) | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
     options = ServiceOptions(
-        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq)
-    )
+        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq),
+        stated=(wave_speed, height),
+    )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
 
@@ -185,6 +201,8 @@ def serve(
     filter_: Filter = "iekf",
     noise: Noise = None,
     gap: Gap = None,
+    wave_speed: WaveSpeed = None,
+    height: Height = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
@@ -199,8 +217,9 @@ def serve(
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     options = ServiceOptions(
-        settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False
-    )
+        settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
+        stated=(wave_speed, height),
+    )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
 
@@ -247,7 +266,7 @@ class ServiceOptions:
     recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
     proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
     not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
-    recording. stdout: whether answers go to standard output.
+    recording. stdout: whether answers go to standard output. stated: wave speed and height of the options, or None.
     """
 
     settings: dict[str, Any]
@@ -262,6 +281,7 @@ class ServiceOptions:
     adapter: str | None = None
     stdin: bool = True
     stdout: bool = True
+    stated: tuple[str | None, str | None] = (None, None)
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
@@ -270,13 +290,12 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     `file` is the problem file of the site.
     """
     from optloc.service.recording import read_recording
-    from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
     from optloc.service.stream import Settings, Stream
 
     if not options.speed > 0.0:
         raise InvalidProblem(f"the speed is {options.speed:g}, not positive", "--speed", "give a positive number")
-    site = read_site(file, options.method)
+    site = _site(file, options.method, options.stated)
     adapter = None if options.adapter is None else adapter_of(options.adapter, site.stations)
     recording = None if options.recording is None else read_recording(options.recording)
     # lines of a file can wait, so no proof needs to be skipped
@@ -338,11 +357,21 @@ def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, reco
         _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
 
 
-def run_check(file: Path, method: str) -> int:
-    """Print the input lines that a stream of a site accepts, and return the exit code 0."""
-    from optloc.service.site import read_site
+def _site(file: Path, method: str, stated: tuple[str | None, str | None]) -> Site:
+    """Return the site of a file; `stated` has the wave speed and the height of the options, or None."""
+    from optloc.files import WaveOptions
+    from optloc.service.site import SiteOptions, read_site
 
-    site = read_site(file, method)
+    speed, height = stated
+    return read_site(file, method, SiteOptions(WaveOptions(speed), height))
+
+
+def run_check(file: Path, method: str, stated: tuple[str | None, str | None] = (None, None)) -> int:
+    """Print the input lines that a stream of a site accepts, and return the exit code 0.
+
+    `stated` has the wave speed and the height of the options, or None.
+    """
+    site = _site(file, method, stated)
     for line in input_description(site):
         typer.echo(visible(line))
     return 0

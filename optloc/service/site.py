@@ -16,10 +16,12 @@ import numpy as np
 from optloc.engine import Cache
 from optloc.files import (
     FREE,
+    ConstraintTable,
     Draft,
     ProblemFile,
     StatedConstraint,
     Table,
+    WaveOptions,
     assemble,
     join,
     limits_of,
@@ -28,6 +30,8 @@ from optloc.files import (
     read_document,
     speed_of,
     table_of,
+    with_options,
+    with_profile,
 )
 from optloc.model_checks import least_values
 from optloc.models import MODELS
@@ -57,6 +61,21 @@ class UnknownName(InvalidProblem):
 
     event: str = ""
     whole: bool = True
+
+
+class SiteOptions(NamedTuple):
+    """Options of a command that replace statements of the file: on the wave, and the known height of the targets."""
+
+    wave: WaveOptions = WaveOptions()
+    height: str | None = None
+
+    def apply(self, file: ProblemFile) -> ProblemFile:
+        """Return the file with these options."""
+        file = with_options(file, self.wave)
+        if self.height is None:
+            return file
+        level = ConstraintTable(kind="height", exactly=self.height)
+        return file.model_copy(update={"constraints": [*file.constraints, level]})
 
 
 class SiteRow(NamedTuple):
@@ -171,6 +190,8 @@ class Site:
         Number of each row of the template.
     number : dict of str to int
         Number of each station.
+    options : SiteOptions
+        Options that replaced statements of the file.
     """
 
     source: str
@@ -191,6 +212,7 @@ class Site:
     hearing: tuple[int, ...]
     index: dict[tuple[str, str, str], int]
     number: dict[str, int]
+    options: SiteOptions
 
     def find(self, kind: str, a: str, b: str) -> int | SiteRow:
         """Return the row of an event by kind and stations.
@@ -357,7 +379,7 @@ def _row_setting(given: Array | None, key: str, row: SiteRow, source: str) -> fl
     return 1.0 if key == "weight" else 0.0
 
 
-def read_site(path: Path, method: str = "auto") -> Site:
+def read_site(path: Path, method: str = "auto", options: SiteOptions | None = None) -> Site:
     """Return the site of a problem file.
 
     Parameters
@@ -366,6 +388,8 @@ def read_site(path: Path, method: str = "auto") -> Site:
         The file; its rows are the template of an event and need no values.
     method : str
         Method of the fixes.
+    options : SiteOptions, optional
+        Options that replace statements of the file.
 
     Raises
     ------
@@ -373,7 +397,8 @@ def read_site(path: Path, method: str = "auto") -> Site:
         For an invalid file, and for properties that single events cannot have: moving stations or targets, estimated
         noise, decibels.
     """
-    file, source = read_document(path), name_of(path)
+    source, options = name_of(path), options or SiteOptions()
+    file = with_profile(options.apply(read_document(path)), path.parent, source)
     station_table = table_of(file.stations, path.parent, join(source, "[stations]"))
     places, limits = places_of(file, path.parent, source), limits_of(file, path.parent, source)
     tables = [
@@ -393,7 +418,7 @@ def read_site(path: Path, method: str = "auto") -> Site:
         source, draft.loaded.title, method, draft.file, station_table, draft.tables, places, limits, rows,
         problem.stations.names, problem.stations.position[0], problem.frame, speed_of(file, source), arriving,
         tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
-        {row[2:5]: i for i, row in enumerate(rows)}, number,
+        {row[2:5]: i for i, row in enumerate(rows)}, number, options,
     )  # fmt: skip
     # report errors of the reader now; an event that cannot be fixed, as with a bias without a prior, gets a status
     # later

@@ -358,7 +358,7 @@ class Stream:
             return
         try:
             with access(anew=True):
-                site = read_site(self._again, self.site.method)
+                site = read_site(self._again, self.site.method, self.site.options)
             warm_up(site, self._settings.phases)
         except InvalidProblem as error:
             self._say(f"The site is not changed: {error}")

@@ -27,6 +27,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.chart import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.around import starts_around
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_MISFIT
 from optloc.solvers.pool import Pool
@@ -268,7 +269,7 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     starts = starts if strata is None else in_every_layer(strata, starts)
     # face 0 has no inequality, and its minima are in the pool already
     on_faces = [_on_face(problem, sides, number, unanswered, starts, descend) for number in range(1, len(sides))]
-    size, width = len(pool.x), starts.shape[1] * len(on_faces)
+    size, width = len(pool.x), sum(found[1].shape[1] for found in on_faces)
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
     cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
     face = np.zeros((size, width), dtype=int)
@@ -351,8 +352,9 @@ def _on_face(
     """Return x, cost, code and face (n, q) of the minima on one face, and the costs (n, q) of infeasible minima.
 
     `number` is the index of the face in `sides`, the list of all faces. `items` (n,) are the numbers of the problems,
-    and `starts` (n, q, size) their starts. Costs are infinite in all other slots.
+    and `starts` (n, q, size) their starts; curved faces get more. Costs are infinite in all other slots.
     """
+    starts = np.concatenate([starts, starts_around(problem, sides[number], items, starts[:, 0])], axis=1)
     shape = starts.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
     x = np.array(starts)
@@ -377,7 +379,8 @@ def is_minimum(problem: Problem, face: Face, x: Array) -> Array:
     good = (violation(problem, x) <= TOLERANCE) & ~is_hidden(problem, x)
     if len(x) and len(face) > len(exact(problem)):
         beside = _inwards(problem, face, x)
-        good &= is_held(problem, face, x, marginal(equations_at(problem, beside))[1])
+        information, vector, _ = marginal(equations_at(problem, beside))
+        good &= is_held(problem, face, x, vector, information)
     return np.asarray(good)
 
 
@@ -393,8 +396,9 @@ def _inwards(problem: Problem, face: Face, x: Array) -> Array:
     gradients = levels(problem, face, x)[1]
     sense = np.array([outwards(problem, level) for level in face])
     away = (sense[:, None] * gradients).sum(1)
-    slot, _ = problem.layout.find("position")
-    part = slice(slot.start, slot.start + slot.size)
+    names = {state_names(target, len(problem.motions), 0)[0] for target in range(len(problem.motions))}
+    own = [slot for slot in problem.layout.shared if slot.name in names]
+    part = np.concatenate([np.arange(slot.start, slot.start + slot.size) for slot in own])
     length = np.sqrt((away[:, part] ** 2).sum(-1, keepdims=True))
     _, spread = centre_and_spread(problem.stations.places)
     out = np.array(x)

@@ -20,6 +20,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
+from optloc.linear.fences import fence_numbers, symbolic_cost
 from optloc.linear.normal import decrement, prior_parts, step, with_station_noise
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
 from optloc.linear.vectors import complete
@@ -142,7 +143,7 @@ class _ScaledProblem:
                         centre[base + k * step : base + k * step + place.size] = shift
         self.unit, self.centre = unit, centre
         rows = parameters(problem)
-        self.data = np.concatenate([unit, centre, rows, [size], bounds(problem)])
+        self.data = np.concatenate([unit, centre, rows, [size], bounds(problem), fence_numbers(problem)])
         self.program = _program(problem, len(self.data), len(rows))
         self.weight = _whitening(problem)
         # absent rows have weight zero, but zero times NaN is NaN
@@ -194,8 +195,8 @@ def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compil
     `data` and `rows` are as in `_program`.
     """
     n = problem.layout.size
-    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, and the
-    # bounds of the constraints.
+    # The numbers p of a problem are n units, n centres, the numbers of the rows, the spread of the stations, the bounds
+    # of the constraints, and the numbers of the fences.
 
     def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
@@ -204,12 +205,16 @@ def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compil
         last = 2 * n + rows
         return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
 
+    def fence_cost(y: Any, p: Any) -> Any:
+        return symbolic_cost(problem, y * p[:n] + p[n : 2 * n], p[data - len(fence_numbers(problem)) :])
+
     equal, more = ((lambda y, p, i=i: limits_at(y, p)[i]) if problem.constraints else None for i in (0, 1))
     return Program(
         n,
         problem.count,
         data,
         residual=scaled_residual,
+        penalty=fence_cost if problem.fences else None,
         equalities=equal,
         inequalities=more,
         diagonal=_independent(problem),

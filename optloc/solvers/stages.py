@@ -27,6 +27,7 @@ from optloc.models.layers import Layers
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_scaled, why_unsupported
+from optloc.solvers.around import starts_on_equalities
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
@@ -401,6 +402,10 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     strata = strata_of(problem, exact(problem)) if damped else None
     if strata is not None:
         wider = offer(problem, pack(in_every_layer(strata, pool.x)), pool, "", began)
+        pool = replace(wider, stages=pool.stages)
+    around = starts_on_equalities(problem, pool.x) if damped else pool.x[:, :0]
+    if around.shape[1]:
+        wider = offer(problem, pack(np.concatenate([pool.x, around], axis=1)), pool, "", began)
         pool = replace(wider, stages=pool.stages)
     x, shape = pool.x.copy(), pool.x.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)

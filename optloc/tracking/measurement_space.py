@@ -94,8 +94,8 @@ def _check_lines(problem: Problem, order: int, window: int | None) -> None:
         raise InvalidProblem(
             "the stations move", "lines", "their measurements are no polynomials in time: use a filter"
         )
-    if problem.constraints or problem.priors:
-        raise InvalidProblem("there are constraints or priors", "lines", "remove them, or use a filter")
+    if problem.constraints or problem.fences or problem.priors:
+        raise InvalidProblem("there are constraints, fences or priors", "lines", "remove them, or use a filter")
     if problem.stations.errors:
         raise InvalidProblem("station positions or velocities have errors", "lines", "use a filter")
     if problem.epochs <= order or (window is not None and window <= order):

@@ -32,6 +32,7 @@ from optloc.tracking.condition import Condition
 from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.level_plane import OnPlane, level_of
 from optloc.tracking.named_models import motion_named
 from optloc.tracking.rivals import Rival, remaining
 from optloc.tracking.scan_rows import Scans
@@ -128,7 +129,8 @@ def tracked(
         If the filter is unknown, the times do not increase, the run has several targets, or the given state does not
         fit the dynamics or contradicts the first scan.
     """
-    rule = filter_of(update)
+    rule, level = filter_of(update), level_of(problem)
+    rule = rule if level is None else OnPlane(rule, level)
     check_trackable(problem)
     _check_run(problem)
     if start is not None:

@@ -270,6 +270,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
         times=(problem.times if times is None else times)[epochs],
         motions=(Motion(span="epoch"),),
         constraints=tuple(for_target(c, 0) for c in problem.constraints if c.target in target and is_of_one_target(c)),
+        fences=tuple(replace(c, target=0) for c in problem.fences if c.target in target),
     )
 
 

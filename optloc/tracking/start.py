@@ -25,6 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.solution import solve
 from optloc.solvers.verdict.findings import Finding, objections
 from optloc.tracking.dynamics import Dynamics
+from optloc.tracking.level_plane import is_level
 from optloc.tracking.rivals import Rival
 from optloc.tracking.track import State, check_trackable
 
@@ -213,6 +214,7 @@ def with_height_rows(problem: Problem) -> Problem:
     """
     # An exact height becomes a row of every scan, so that updates keep it as starts do.
     exact = [c for c in problem.constraints if isinstance(c, Band) and np.array_equal(c.lower, c.upper)]
+    exact = [c for c in exact if not is_level(c)]  # a plane z = h is kept by the filter, see `OnPlane`
     if not exact:
         return problem
     other = next((c for c in exact if c.kind != "height"), None)

@@ -364,6 +364,8 @@ def check_trackable(problem: Problem) -> None:
         )
     if problem.stations.unknown_for:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
+    if problem.fences:
+        raise InvalidProblem("a track cannot use fences", "track", "leave them out, or solve the run as one problem")
 
 
 def check_state(state: State, n: int) -> None:

@@ -90,9 +90,9 @@ def test_locate_accepts_a_height_and_a_speed_with_units():
     np.testing.assert_array_equal(text.x, plain.x)
     np.testing.assert_allclose(text.position, truth, atol=1e-6)
     late = {name: value / 343.0 for name, value in ranges.items()}
-    slow = optloc.locate(anchors, toa=late, sigma="20 us", speed="343 m/s")
+    slow = optloc.locate(anchors, toa=late, sigma="20 us", wave_speed="343 m/s")
     np.testing.assert_allclose(slow.position, truth, atol=1e-3)
-    guessed = optloc.locate(anchors, toa=late, sigma="20 us", speed=("340 m/s", "5 m/s"))
+    guessed = optloc.locate(anchors, toa=late, sigma="20 us", wave_speed=("340 m/s", "5 m/s"))
     np.testing.assert_allclose(guessed.position, truth, atol=0.1)
 
 

@@ -308,3 +308,143 @@ def test_regions_are_drawn(tmp_path):
     assert np.isfinite(box).all()
     figure = plot_fixes(problem, fix)
     assert "region" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+# Files that constraints name.
+
+SQUARE = [[1000.0, 1000.0], [2000.0, 1000.0], [2000.0, 3000.0], [1000.0, 3000.0]]
+ROAD = [[0.0, 900.0], [1000.0, 1500.0], [2500.0, 4000.0]]
+ASC = "ncols 4\nnrows 3\nxllcorner 0\nyllcorner 1000\ncellsize 1000\nNODATA_value -9999\n1 2 3 4\n5 6 7 8\n9 10 11 12\n"
+
+
+def lonlat(points):
+    frame = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
+    lat, lon, _ = frame.to_geodetic(np.c_[points, np.zeros(len(points))])
+    return np.degrees([lon, lat]).T.tolist()
+
+
+def feature(kind, points):
+    ring = [[*points, points[0]]] if kind == "Polygon" else points
+    geometry = {"type": kind, "coordinates": ring}
+    return json.dumps({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": geometry}]})
+
+
+def table(columns, points):
+    return columns + "\n" + "".join(",".join(repr(float(value)) for value in point) + "\n" for point in points)
+
+
+def test_lines_and_polygons_from_files(tmp_path):
+    degrees, road = lonlat(SQUARE), lonlat(ROAD)
+    contents = {
+        "a.geojson": feature("Polygon", degrees),
+        "a.csv": table("x_km,y_km", (np.array(SQUARE) / 1e3).tolist()),
+        "b.csv": table("lat,lon", [point[::-1] for point in degrees]),
+        "r.geojson": feature("LineString", road),
+        "r.csv": table("x,y", ROAD),
+        "s.csv": table("x,y", (np.array(ROAD) / 1e3).tolist()),
+    }
+    for name, text in contents.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    for name in ("a.geojson", "a.csv", "b.csv"):
+        (found,) = load(write(tmp_path, demand(f'kind = "keep-out-polygon"\nfile = "{name}"'))).constraints
+        assert found.outside
+        np.testing.assert_allclose(found.vertices, SQUARE, atol=1e-3)
+    for name, more in (("r.geojson", ""), ("r.csv", ""), ("s.csv", '\nunit = "km"')):
+        text = demand(f'kind = "polyline"\nfile = "{name}"\ntolerance = "20 m"{more}')
+        (found,) = load(write(tmp_path, text)).constraints
+        np.testing.assert_allclose(found.members[1][0].coefficients, np.ravel(ROAD[1:]), atol=1e-3)
+        assert float(found.members[0][0].upper) == 20.0
+
+
+def test_grids_of_heights_from_files(tmp_path):
+    x, y = np.arange(4.0) * 1e3 + 500.0, np.arange(3.0) * 1e3 + 1500.0
+    heights = np.array([[9.0, 10, 11, 12], [5, 6, 7, 8], [1, 2, 3, 4]]).T
+    points = [[a, b, heights[i, j]] for j, b in enumerate(y) for i, a in enumerate(x)]
+    (tmp_path / "g.asc").write_text(ASC, encoding="utf-8")
+    (tmp_path / "g.csv").write_text(table("x,y,height", points[::-1]), encoding="utf-8")
+    for name in ("g.asc", "g.csv"):
+        (found,) = load(write(tmp_path, demand(f'kind = "terrain"\nfile = "{name}"\nmin = "2 m"'))).constraints
+        assert (found.table.x.tolist(), found.table.y.tolist()) == (x.tolist(), y.tolist())
+        np.testing.assert_array_equal(found.table.height, heights)
+        assert (float(found.lower), float(found.upper)) == (2.0, np.inf)
+
+
+BAD_FILES = {
+    "missing": ("no.csv", None, ["no.csv", "no such file"]),
+    "another type": ("a.doc", "", ["'a.doc' has an unknown type", ".geojson"]),
+    "outside": ("../a.csv", None, ["outside the folder"]),
+    "no line": ("a.geojson", feature("Polygon", ROAD), ["a.geojson", "the file has no line"]),
+    "two lines": (
+        "a.geojson",
+        json.dumps({"type": "GeometryCollection", "geometries": [{"type": "LineString", "coordinates": ROAD}] * 2}),
+        ["the file has 2 lines"],
+    ),
+    "no points": ("a.geojson", '{"type": "LineString", "coordinates": [["a", 2], 3]}', ["not a list of points"]),
+    "no json": ("a.geojson", "x", ["not JSON"]),
+    "no columns": ("a.csv", "a,b\n1,2\n", ["a.csv", "no column 'x'"]),
+    "no number": ("a.csv", "x,y\n1,b\n", ["row 1", "column 'y'"]),
+    "one point": ("a.csv", "x,y\n1,2\n", ["the polyline has 1 points"]),
+    "repeated point": ("a.csv", "x,y\n1,2\n1,2\n", ["point 2 repeats point 1"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_wrong_file_is_one_sentence(name, tmp_path):
+    path, content, words = BAD_FILES[name]
+    if content is not None:
+        (tmp_path / path).write_text(content, encoding="utf-8")
+    source = write(tmp_path, demand(f'kind = "polyline"\nfile = "{path}"\ntolerance = 20'))
+    result = run("fix", source, code=2)
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert all(word in result.stderr for word in words), result.stderr
+
+
+BAD_GRIDS = {
+    "no header": ("g.asc", "1 2\n3 4\n", "the header has no ncols"),
+    "short": ("g.asc", ASC.replace("9 10 11 12", "9 10"), "10 heights are not 4 columns by 3 rows"),
+    "text": ("g.asc", ASC.replace("11", "wet"), "'wet' is not a height"),
+    "word in the header": ("g.asc", ASC.replace("cellsize 1000", "cellsize wide"), "cellsize is 'wide'"),
+    "gap": ("g.asc", ASC.replace("11", "-9999"), "1 cells have no height"),
+    "no full grid": ("g.csv", "x,y,height\n0,0,1\n0,1,1\n1,0,1\n", "not a full grid of 2 by 2 points"),
+    "repeated": ("g.csv", "x,y,height\n0,0,1\n0,0,1\n1,0,1\n1,1,2\n", "a grid point occurs twice"),
+    "no heights": ("g.csv", "x,y\n0,0\n", "no column 'height'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_GRIDS)
+def test_a_wrong_grid_is_one_sentence(name, tmp_path):
+    path, content, words = BAD_GRIDS[name]
+    (tmp_path / path).write_text(content, encoding="utf-8")
+    with pytest.raises(InvalidProblem, match=words):
+        load(write(tmp_path, demand(f'kind = "terrain"\nfile = "{path}"\nexactly = 0')))
+
+
+def test_a_file_named_by_an_option_or_in_python_is_anywhere(tmp_path):
+    (tmp_path / "roads").mkdir()
+    (tmp_path / "roads" / "r.csv").write_text(table("x,y", ROAD), encoding="utf-8")
+    line = tmp_path / "roads" / "r.csv"
+    source = write(tmp_path / "roads" / "..", ranging(ranges(TRUTH[:2]), PLANE))
+    text = run("fix", source, "--constraint", f"polyline file={line} tolerance=20 m", "--json", code=1).stdout
+    assert json.loads(text)["fixes"][0]["active"][0]["name"].startswith("polyline")
+    limits = [{"kind": "polyline", "file": str(line), "tolerance": 20.0}]
+    places = {name: place[:2] for name, place in PLACES.items()}
+    problem = from_table(pd.DataFrame(ranges(TRUTH[:2])), places, kind="range", sigma=5.0, constraints=limits)
+    assert [c.name for c in problem.constraints] == ["polyline"]
+    bad = run("fix", source, "--constraint", "disc x=0 y=0", "--constraint", "disc x=0 y=0 radius=0", code=2).stderr
+    assert "--constraint 1: disc has no 'radius'" in bad
+
+
+def test_copies_of_a_problem_file_keep_the_files_of_constraints(tmp_path):
+    (tmp_path / "r.csv").write_text(table("x,y", ROAD), encoding="utf-8")
+    source = write(tmp_path, demand('kind = "polyline"\nfile = "r.csv"\ntolerance = "20 m"\nname = "road"'))
+    (tmp_path / "sub").mkdir()
+    write_measured(source, tmp_path / "sub" / "again.toml", read(source).problem.z[None])
+    (one,), (two,) = load(source).constraints, load(tmp_path / "sub" / "again.toml").constraints
+    assert (one.name, str(one.members)) == (two.name, str(two.members))
+    assert json.loads(run("check", source, "--json").stdout)["constraints"] == ["road"]
+
+
+def test_the_option_is_listed_and_completed():
+    listed = json.loads(run("list", "constraints", "--json").stdout)
+    assert {"polyline", "terrain", "box"} <= {row["constraint"] for row in listed}
+    assert "--constraint" in run("fix", "--help").stdout

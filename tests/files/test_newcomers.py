@@ -241,7 +241,7 @@ def test_kinds_together_and_sound():
     time = {name: np.linalg.norm(TAG - at) / optloc.units.sound_in_air(20.0) for name, at in ANCHORS.items()}
     angle = {"A": float(np.degrees(np.arctan2(*TAG)))}
     sigma = {"toa": 1e-4, "bearings": 2.0}
-    fix = locate(ANCHORS, toa=time, bearings=angle, sigma=sigma, speed=optloc.units.sound_in_air(20.0))
+    fix = locate(ANCHORS, toa=time, bearings=angle, sigma=sigma, wave_speed=optloc.units.sound_in_air(20.0))
     assert fix.position == pytest.approx(TAG, abs=1e-6)
 
 
@@ -271,7 +271,7 @@ WRONG = {
         {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": {}},
         "not a height",
     ),
-    "a speed that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "speed": "fast"}, "speed"),
+    "a speed that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "wave_speed": "fast"}, "wave_speed"),
     "a unit that is none": (
         {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": [1]},
         "list is not text",

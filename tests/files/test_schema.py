@@ -38,5 +38,5 @@ def test_the_schema_lists_the_kinds_of_constraints_and_their_keys():
     table = schema()["$defs"]["ConstraintTable"]
     assert set(CONSTRAINT_KINDS) <= set(table["properties"]["kind"]["enum"])
     keys = {each["if"]["properties"]["kind"]["const"]: each["then"]["propertyNames"]["enum"] for each in table["allOf"]}
-    assert keys["disc"] == ["kind", "target", "name", "x", "y", "radius", "lat_deg", "lon_deg", "unit"]
+    assert keys["disc"] == ["kind", "target", "name", "x", "y", "lat_deg", "lon_deg", "radius", "unit"]
     assert {key for names in keys.values() for key in names} <= set(table["properties"])

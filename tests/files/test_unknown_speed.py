@@ -102,7 +102,7 @@ def test_a_sigma_needs_times_and_no_second_scale(tmp_path):
 
 
 def test_locate_takes_a_speed_with_its_sigma():
-    fix = locate(PLACE, toa=TIMES, sigma=1e-5, speed=(343.0, 5.0))
+    fix = locate(PLACE, toa=TIMES, sigma=1e-5, wave_speed=(343.0, 5.0))
     assert fix.status.label == "ok"
     assert fix.certificate.proof == "global"
     np.testing.assert_allclose(fix.position, TRUTH, atol=0.02)
@@ -112,15 +112,15 @@ def test_locate_takes_a_speed_with_its_sigma():
 @pytest.mark.parametrize("speed", [(343.0, 5.0, 1.0), (0.0, 5.0), (343.0, 0.0), (343.0, -5.0), (np.nan, 5.0), (343.0,)])
 def test_bad_speeds_of_locate_are_refused(speed):
     with pytest.raises(InvalidProblem, match="speed"):
-        locate(PLACE, toa=TIMES, sigma=1e-5, speed=speed)
+        locate(PLACE, toa=TIMES, sigma=1e-5, wave_speed=speed)
 
 
 def test_locate_refuses_a_sigma_of_the_speed_for_lengths():
     with pytest.raises(InvalidProblem, match="no measurement is a time"):
-        locate(PLACE, ranges=343.0 * TIMES, sigma=0.01, speed=(343.0, 5.0))
+        locate(PLACE, ranges=343.0 * TIMES, sigma=0.01, wave_speed=(343.0, 5.0))
 
 
 def test_the_answer_shows_the_speed():
-    text = str(locate(PLACE, toa=TIMES, sigma=1e-5, speed=(343.0, 5.0)))
+    text = str(locate(PLACE, toa=TIMES, sigma=1e-5, wave_speed=(343.0, 5.0)))
     line = next(line for line in text.splitlines() if line.startswith("speed") and "m/s" in line and "true" in line)
     assert "349.9" in line or "350" in line

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from linear.test_constraints import ENU, PLANE, SPACE, above, moving
+from linear.constraints.test_faces import ENU, PLANE, SPACE, above, moving
 from often import few
 from scipy.optimize import minimize
 

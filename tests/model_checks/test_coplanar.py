@@ -100,7 +100,7 @@ def test_a_fix_in_the_plane_is_proven_and_says_that_it_may_be_on_either_side() -
     names |= {"m4": (2.85, 2.65, 0), "m5": (4.82, 2.65, 0), "m6": (5.8, 2.65, 0)}
     far = np.linalg.norm(np.array(list(names.values())) - (1, 1, 0), axis=1)
     times = far / 343.0 + 1e-5 * np.random.default_rng(0).standard_normal(6)
-    fix = optloc.locate(names, toa=dict(zip(names, times, strict=True)), sigma=1e-5, speed=343.0)
+    fix = optloc.locate(names, toa=dict(zip(names, times, strict=True)), sigma=1e-5, wave_speed=343.0)
     assert fix.status.label == "curved"
     assert fix.certificate.proof == "global"
     np.testing.assert_allclose(fix.position, (1.002, 1.001, 0.0), atol=1e-3)

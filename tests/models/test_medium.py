@@ -205,7 +205,7 @@ def test_locate_takes_layers():
     )
     assert fix.layout.find("emission")[0].unit == "m"
     with pytest.raises(InvalidProblem, match="Layers"):
-        optloc.locate({"A": (0, 0, 0)}, ranges={"A": 1.0}, sigma=1.0, speed="sound")
+        optloc.locate({"A": (0, 0, 0)}, ranges={"A": 1.0}, sigma=1.0, wave_speed="sound")
 
 
 @pytest.mark.parametrize(

@@ -51,3 +51,14 @@ def test_what_single_events_cannot_have_is_refused(tmp_path, old, new, said):
     path.write_text(SITE.replace("arrival_sigma", "sigma").replace(old, new))
     with pytest.raises(InvalidProblem, match=said):
         read_site(path)
+
+
+def test_constraints_with_files_are_read_once_and_hold_for_each_event(tmp_path):
+    (tmp_path / "road.csv").write_text("x,y\n0,1500\n1500,2500\n4000,2600\n")
+    text = SITE + '[[constraints]]\nkind = "polyline"\nfile = "road.csv"\ntolerance = "5 m"\nname = "road"\n'
+    site = site_in(tmp_path, text, FAST)
+    (tmp_path / "road.csv").unlink()  # an event needs no file
+    ready = site.ready((), site.rows[:4])
+    paths = np.linalg.norm(site.position - [1400.0, 2600.0, 300.0], axis=1)
+    fix = ready.fast(ready.si(np.zeros((1, 0)), (paths[1:5] - paths[0])[None]))
+    assert [active.name for active in fix.active[0]] == ["road 1 upper"]

@@ -53,7 +53,7 @@ def test_three_listeners_kilometres_apart():
     (0, 5), where A and B would hear it together. The data give y = 5 and 15 x^2 = 85, a root of its own equations.
     """
     places = {"A": (-8e3, 0.0), "B": (8e3, 0.0), "C": (8e3, 10e3)}
-    fix = optloc.locate(places, toa={"A": 12.0, "B": 0.0, "C": 0.0}, sigma="10 ms", speed=1e3 / 3.0)
+    fix = optloc.locate(places, toa={"A": 12.0, "B": 0.0, "C": 0.0}, sigma="10 ms", wave_speed=1e3 / 3.0)
     assert fix.status is optloc.Status.OK
     assert fix.position == pytest.approx([1e3 * np.sqrt(85.0 / 15.0), 5e3], abs=1.0)
 
@@ -65,7 +65,7 @@ def test_a_gun_and_three_microphones_on_a_line():
     computed distance is 959 m at 87.5 degrees; the drawing is accurate to its circles. One option decides the side.
     """
     places = {"A": (0.0, 0.0), "B": (1000.0, 0.0), "C": (2000.0, 0.0)}
-    data = {"toa": {"A": 0.0, "B": 1.2, "C": 3.7}, "sigma": "10 ms", "speed": 330.0}
+    data = {"toa": {"A": 0.0, "B": 1.2, "C": 3.7}, "sigma": "10 ms", "wave_speed": 330.0}
     fix = optloc.locate(places, **data)
     assert fix.status is optloc.Status.AMBIGUOUS
     assert abs(fix.alternatives.x[0, 1]) == pytest.approx(abs(fix.position[1]), abs=0.1)
@@ -139,7 +139,7 @@ def test_a_bird_and_six_recorders():
     """Bioacoustics: github.com/kitzeslab/opensoundscape, tests/test_localization.py, test_gillette_localize_3d."""
     recorders = np.array([[0, 0, 10], [0, 20, 1], [20, 20, -1], [20, 0, 0.1], [10, 10, 0], [5, 5, 5]], dtype=float)
     flight = np.linalg.norm(recorders - [10.0, 12.0, 2.0], axis=1) / 343.0
-    fix = optloc.locate(recorders, toa=flight.round(6), sigma="10 us", speed=343.0)
+    fix = optloc.locate(recorders, toa=flight.round(6), sigma="10 us", wave_speed=343.0)
     assert fix.status is optloc.Status.OK
     assert fix.position == pytest.approx([10.0, 12.0, 2.0], abs=0.002)
 
@@ -151,7 +151,7 @@ def test_a_call_that_four_recorders_hear_together():
     (10, 10, 0).
     """
     recorders = np.array([[0.0, 0.0, 0.0], [0.0, 20.0, 1.0], [20.0, 20.0, -1.0], [20.0, 0.0, 0.1]])
-    fix = optloc.locate(recorders, toa=[1.0, 1.0, 1.0, 1.0], sigma="0.1 ms", speed=343.0)
+    fix = optloc.locate(recorders, toa=[1.0, 1.0, 1.0, 1.0], sigma="0.1 ms", wave_speed=343.0)
     centre = np.linalg.solve(2.0 * recorders[1:], (recorders[1:] ** 2).sum(1))
     assert fix.position == pytest.approx(centre, abs=0.01)
     assert fix.position == pytest.approx([10.0, 10.0, 0.0], abs=0.1)
@@ -165,7 +165,7 @@ def test_a_transponder_far_from_a_small_array_under_water():
     """
     hydrophones = -np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
     seconds = np.linalg.norm(hydrophones - 250.0, axis=1) / 1500.0
-    fix = optloc.locate(hydrophones, ranges=seconds, unit="s", sigma="0.1 us", speed=1500.0)
+    fix = optloc.locate(hydrophones, ranges=seconds, unit="s", sigma="0.1 us", wave_speed=1500.0)
     assert fix.status is optloc.Status.OK
     assert fix.position == pytest.approx([250.0, 250.0, 250.0], abs=0.05)
 
@@ -183,7 +183,7 @@ def test_a_stroke_on_a_plate_with_four_sensors(samples, published):
     half = 0.101
     sensors = {"NW": (-half, half), "NE": (half, half), "SE": (half, -half), "SW": (-half, -half)}
     toa = dict(zip(sensors, np.array(samples) / 44100.0, strict=True))
-    fix = optloc.locate(sensors, toa=toa, sigma="0.05 ms", speed=82.0)
+    fix = optloc.locate(sensors, toa=toa, sigma="0.05 ms", wave_speed=82.0)
     assert fix.status is optloc.Status.OK
     assert fix.position == pytest.approx(published, abs=0.007)
 

@@ -1,9 +1,10 @@
-"""Constraints: functions for users to state them, and the faces on which an estimate may be.
+"""Constraints and fences: functions for users to state them, and the faces on which an estimate may be.
 
 A *level* is one bound of one constraint, satisfied with equality. A *face* is a set of levels that are satisfied
 together. A *band* is a constraint ``lower <= g(x) <= upper``; its *quantity* is g.
 """
 
+from optloc.linear.constraints.chance import chance as chance
 from optloc.linear.constraints.cones import is_held as is_held
 from optloc.linear.constraints.faces import (
     bounds as bounds,
@@ -23,6 +24,7 @@ from optloc.linear.constraints.levels import (
     is_corner as is_corner,
     is_flat as is_flat,
     is_height as is_height,
+    kind_of as kind_of,
     levels as levels,
     on_face as on_face,
     outwards as outwards,
@@ -71,3 +73,4 @@ from optloc.linear.constraints.violation import (
     violation_names as violation_names,
     violation_of as violation_of,
 )
+from optloc.linear.fences import fence as fence

@@ -24,7 +24,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.show.pictures import style
-from optloc.show.pictures.regions import DrawnRegion
+from optloc.show.pictures.constraint_shapes import DrawnRegion
 from optloc.show.pictures.style import (
     BLACK,
     BLUE,

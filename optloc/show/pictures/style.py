@@ -24,8 +24,8 @@ from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.show.pictures.constraint_shapes import DrawnRegion, drawn_regions
 from optloc.show.pictures.outlines import outlines_of
-from optloc.show.pictures.regions import DrawnRegion, drawn_regions
 from optloc.uncertainty.outline import Outline
 
 if TYPE_CHECKING:

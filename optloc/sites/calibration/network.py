@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from optloc.engine import numbers
+from optloc.files import positive_speed, stated_speed
 from optloc.models import MODELS, kind_named
-from optloc.problem import Array, InvalidProblem, check_once, nearest
+from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, check_once, nearest
 
 CLOCKED = ("toa", "tdoa")
 """Kinds that depend on the station clock; a two-way range does not."""
@@ -140,6 +141,21 @@ class Network:
         )
 
 
+def network_speed(given: Amount | None, where: str) -> float:
+    """Return the wave speed of a network, m/s; light without a stated speed.
+
+    `given` is a number, or text as for `optloc.locate`, such as "air:20C". `where` is the place for messages. Raise
+    InvalidProblem for an uncertain speed, or the file of a profile, which networks cannot use.
+    """
+    if not isinstance(given, str):
+        return SPEED_OF_LIGHT if given is None else positive_speed(given, "speed", where)
+    stated = stated_speed(given, where)
+    if stated.sigma is not None:
+        advice = "leave the standard deviation out; a wrong speed scales the network"
+        raise InvalidProblem("the speed of a network is exact", where, advice)
+    return stated.speed
+
+
 def network_of(
     z: Any,
     sigma: Any,
@@ -153,6 +169,7 @@ def network_of(
     synchronised: bool = True,
     distances: Sequence[tuple[int, int, float, float]] = (),
     labels: Sequence[str] | None = None,
+    wave_speed: Amount | None = None,
 ) -> Network:
     """Return a network with one kind of measurements.
 
@@ -180,6 +197,8 @@ def network_of(
         Measured distances between stations, metres.
     labels : sequence of N str, optional
         Names of the pulses.
+    wave_speed : float or str, optional
+        Wave speed, m/s or text such as "air:20C". If it is given, `z` and `sigma` are times in seconds.
 
     Returns
     -------
@@ -192,13 +211,15 @@ def network_of(
         If an argument is invalid; the message names it.
     """
     kind = kind_named(kind)
+    metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed")
+    z, sigma = metres * np.asarray(z, dtype=float), metres * np.asarray(sigma, dtype=float)
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
     if (kind == "tdoa") != (pairs is not None):
         raise InvalidProblem(
             "the argument pairs and the kind tdoa need each other", "pairs", 'give pairs with kind="tdoa" only'
         )
-    values = np.asarray(numbers(np.where(np.isnan(z := np.asarray(z, dtype=float)), 0.0, z), "z"))
+    values = np.asarray(numbers(np.where(np.isnan(z), 0.0, z), "z"))
     if values.ndim != 2 or not values.size:
         raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one row for each pulse")
     count = values.shape[1] if pairs is None else 1 + max(max(pair) for pair in pairs)

@@ -25,7 +25,6 @@ from optloc.files import (
     join,
     name_of,
     parse_toml,
-    positive_speed,
     read_text,
     sigma_of,
     table_of,
@@ -36,9 +35,9 @@ from optloc.files import (
     write_text,
 )
 from optloc.models import MODELS, kind_named
-from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, nearest
+from optloc.problem import Amount, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
-from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked
+from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked, network_speed
 
 # Smallest standard deviation of stations in the output file, metres: as good as exact.
 _EXACT = 1e-6
@@ -87,13 +86,20 @@ class NetworkFile(_NetworkTable):
     title: str | None = None
     """Title of the network."""
     propagation_speed: Amount | None = None
-    """Metres per second, or an amount such as "1480 m/s"; the speed of light by default."""
+    """Metres per second, or text such as "1480 m/s", "air:20C" or "water:8C,35,50m"; the speed of light by default."""
     stations: NetworkStations
     measurements: list[NetworkRows] = Field(min_length=1)
 
 
-def read_network(path: Path) -> Network:
+def read_network(path: Path, wave_speed: str | None = None) -> Network:
     """Return the network of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    wave_speed : str, optional
+        Wave speed that replaces the speed of the file, such as "air:20C".
 
     Raises
     ------
@@ -107,8 +113,8 @@ def read_network(path: Path) -> Network:
         what = f"the key {foreign[0]!r} belongs to a problem with known stations, not to a network"
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
     file = validated(NetworkFile, data, source)
-    stated, where = file.propagation_speed, join(source, "key 'propagation_speed'")
-    speed = SPEED_OF_LIGHT if stated is None else positive_speed(stated, "speed", where)
+    given, where = file.propagation_speed, join(source, "key 'propagation_speed'")
+    speed = network_speed(*((given, where) if wave_speed is None else (wave_speed, "--wave-speed")))
     table = with_standard_columns(
         table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit
     )

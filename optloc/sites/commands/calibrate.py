@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from optloc.cli import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose
+from optloc.cli import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose, WaveSpeed
 
 if TYPE_CHECKING:
     from optloc.sites.calibration import Calibration
@@ -34,6 +34,7 @@ def calibrate(
     robust: Robust = False,
     out: Out = None,
     plot: Picture = None,
+    wave_speed: WaveSpeed = None,
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -45,15 +46,16 @@ def calibrate(
 
     FILE lists the stations, with coordinates only where these are known, and the measurements of each pulse.
     """
-    raise typer.Exit(_run(file, gauge, seed, out, plot, robust=robust, as_json=as_json, quiet=quiet))
+    outputs = (out, plot)
+    raise typer.Exit(_run(file, gauge, seed, outputs, wave_speed, robust=robust, as_json=as_json, quiet=quiet))
 
 
 def _run(
     file: Path,
     gauge: str | None,
     seed: int,
-    out: Path | None,
-    plot: Path | None,
+    outputs: tuple[Path | None, Path | None],
+    wave_speed: str | None,
     *,
     robust: bool,
     as_json: bool,
@@ -61,17 +63,19 @@ def _run(
 ) -> int:
     """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1.
 
-    `gauge` are names of stations, separated by commas. `out` is a problem file, and `plot` is a picture.
+    `gauge` are names of stations, separated by commas. `outputs` are the problem file and the picture to write.
+    `wave_speed` replaces the wave speed of the file.
     """
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
     from optloc.sites.calibration.network_file import check_name, read_network, write_calibrated
 
+    out, plot = outputs
     claim_outputs(out, picture=plot, inputs=[file])
     if out is not None:
         check_name(out)
-    network = read_network(file)
+    network = read_network(file, wave_speed)
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
     with line(quiet or as_json) as tell:
         tell("searching")

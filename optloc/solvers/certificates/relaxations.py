@@ -129,7 +129,8 @@ def _beyond(problem: Problem) -> str:
         return "the relaxation does not support biases and priors"
     if problem.stations.errors:
         return "the relaxation does not support station errors"
-    return "the relaxation does not support constraints" if problem.constraints else ""
+    stated = problem.constraints or problem.fences
+    return "the relaxation does not support constraints and fences" if stated else ""
 
 
 def _beyond_moments(problem: Problem) -> str:

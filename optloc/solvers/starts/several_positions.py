@@ -71,7 +71,7 @@ def _isolate(problem: Problem, target: int) -> Problem:
         for c in own
         if motion.order == 0 or ((is_exact(c) or _applies_along(c)) and not needs_velocity(c))
     )
-    return replace(problem, motions=(motion,), constraints=constraints)
+    return replace(problem, motions=(motion,), constraints=constraints, fences=())
 
 
 def _applies_along(constraint: Constraint) -> bool:

@@ -382,7 +382,7 @@ def fix_remaining(problem: Problem) -> Fix:
 
 def _is_proven(problem: Problem, pool: Pool) -> Array:
     """Return flags (N,) of rests for which a short proof shows that all minima within the listed gap are known."""
-    if not enabled() or problem.constraints or is_run(problem) or is_scaled(problem):
+    if not enabled() or problem.constraints or problem.fences or is_run(problem) or is_scaled(problem):
         return np.zeros(len(pool), dtype=bool)
     claims = certified(problem, pool, effort=_SHORT).proven
     assert claims is not None

@@ -19,6 +19,7 @@ from optloc.base.linalg import centre_and_spread, centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import PRECEDENCE, Array, Certificate, Status
 from optloc.linear.constraints import faces
+from optloc.linear.fences import skew_of, unfenced
 from optloc.linear.mirror import one_position, rows_of_stations
 from optloc.linear.redundancy import largest
 from optloc.model_checks.shape import BENT, cost_at_infinity, departure
@@ -307,6 +308,10 @@ def _departure(problem: Problem, pool: Pool) -> Array:
     if pool.loss:
         problem = problem.with_rows(weight=pool.weights)
     x, covariance, centre = pool.x[:, 0], pool.curvature.covariance, centre_of(problem)
+    if problem.fences:  # their departure from a Gaussian is known exactly, so only the rows are tested
+        free, x = unfenced(problem, x, covariance), np.array(x)
+        x[:, : free.shift.shape[1]] += free.shift
+        problem, covariance = replace(problem, fences=()), free.covariance
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
     sides = faces(problem) if problem.constraints else [()]
     out = np.empty((len(x), 2))
@@ -442,7 +447,8 @@ def chart_of(
     inflation = None if curvature.repeats is None else np.where(holds(curvature.repeats), curvature.repeats[:, 2], 1.0)
     centre = centre_of(problem)
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
-    return Chart(kind, x[:, part], covariance[:, part, part], centre, truncated, inflation)
+    skew = skew_of(problem, x, curvature.covariance, part)
+    return Chart(kind, x[:, part], covariance[:, part, part], centre, truncated, inflation, skew)
 
 
 def chart_kind(metres: Any, inverse: Any) -> Any:

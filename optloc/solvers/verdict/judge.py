@@ -18,6 +18,7 @@ from optloc.base.records import join, overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.rank import open_sentences
 from optloc.linear.constraints import violation_names
+from optloc.linear.fences import margins, posterior_spread, unfenced
 from optloc.linear.least_squares_ranges import ranges
 from optloc.model_checks.advice import misfit_of
 from optloc.model_checks.truncation import covariance_of
@@ -121,6 +122,8 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     proven = merged_claims(finished, _claims(pool), NO_ANSWER)
     if pool.free is not None:
         _mark_contradictions(pool, cost, finished, marks, reason)
+    if problem.fences:
+        _mark_fences(problem, pool, cost, finished, marks, reason)
     code = first_status(marks)
     explain(Finished(problem, pool, gap, proven), code, reason)
     if pool.hidden is not None:
@@ -313,6 +316,28 @@ def _mark_contradictions(pool: Pool, cost: Array, finished: Array, marks: Array,
         )
 
 
+def _mark_fences(problem: Problem, pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
+    """Mark fixes whose data contradict uncertain fences, under the conditions of `_mark_contradictions`.
+
+    For a target on the boundary, the cost of a fence is chi-square with two degrees of freedom; inside it is smaller.
+    Fences far from the fix do not count.
+    """
+    assert pool.curvature is not None
+    with np.errstate(all="ignore"):
+        free = unfenced(problem, pool.x[:, 0], pool.curvature.covariance).cost + cost
+        near = margins(problem, pool.x[:, 0]) < _NEAR_FENCE
+        data_agree = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= P_SUSPECT)
+        costly = chdtrc(np.maximum(2 * near.sum(1), 1), np.maximum(cost - free, 0.0)) < P_SUSPECT
+    for i in np.flatnonzero(near.any(1) & finished & np.isfinite(free) & data_agree & costly):
+        names = " and ".join(one.name for one, is_near in zip(problem.fences, near[i], strict=True) if is_near)
+        marks[i] |= Status.CONTRADICTORY.mark
+        reason[i] = f"the data and {names} disagree: chi-square {cost[i]:.3g} with it, {max(free[i], 0.0):.3g} without"
+
+
+# Margin of a fence, in standard deviations, from which it has no part in a contradiction.
+_NEAR_FENCE = 4.0
+
+
 def _name_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
     """Write to `reason` (N,) the limits that a redundancy of 0 or 1 sets to a search for suspects.
 
@@ -413,6 +438,10 @@ def _as_finished(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
     law = law_at(problem, pool)
     covariance = curvature.covariance if law is None else _truncated_covariance(problem, pool, law.truncated)
     truncated = None if law is None else law.truncated
+    if problem.fences:
+        skewed = posterior_spread(problem, pool.x[:, 0], curvature.covariance)
+        cut = np.zeros(count, dtype=bool) if truncated is None else truncated.cuts
+        covariance = np.where(cut[:, None, None], covariance, skewed)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
     # if `pool.plain` is None, `_apply_rules` writes marks, reasons and charts

@@ -15,6 +15,7 @@ from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import Face, face_names, faces, levels, tangent_at
+from optloc.linear.fences import unfenced
 from optloc.linear.mirror import one_position
 from optloc.linear.normal import Normal, local_covariance, marginal
 from optloc.linear.vectors import vectors
@@ -71,6 +72,8 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
         weakest[items] = smallest_pivot(inner) if inner.shape[-1] else 1.0
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
     regular = ok & regular
+    if problem.fences:  # a fence limits the target on one side only, so the rows must determine it
+        regular &= np.isfinite(unfenced(problem, x, covariance).covariance).all((-1, -2))
     local = _local_covariance(problem, equations, covariance)
     return Curvature(covariance, information, regular, weakest, active, local, free=free, shift=shift)
 

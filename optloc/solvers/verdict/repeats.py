@@ -56,7 +56,7 @@ def is_repeatable(problem: Problem) -> bool:
 
     Inequalities are allowed if none is active at the fix.
     """
-    free = not exact(problem) and not problem.stations.errors and problem.medium is None
+    free = not exact(problem) and not problem.stations.errors and problem.medium is None and not problem.fences
     walks = any(form_of(bias).steps is not None for bias in problem.biases)
     if not free or walks or not one_position(problem) or problem.motions[0].order > 0:
         return False

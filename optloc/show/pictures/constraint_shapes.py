@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Polygon
 from optloc.models.primitives import Point
 from optloc.models.surfaces import SURFACES
 from optloc.problem.problem import Problem
@@ -64,7 +64,8 @@ def drawn_regions(problem: Problem, reach: Array, place: Array) -> tuple[DrawnRe
     centre = (reach.min(0) + reach.max(0)) / 2.0
     boxes, rest = _boxes(problem)
     plan = _Plan(centre, scale, place)
-    return (*boxes, *(shape for constraint in rest for shape in plan.shapes(constraint)))
+    shapes = (shape for constraint in rest for shape in plan.shapes(constraint))
+    return (*boxes, *shapes, *(shape for fence in problem.fences for shape in plan.fence(fence)))
 
 
 def _boxes(problem: Problem) -> tuple[list[DrawnRegion], list[Constraint]]:
@@ -72,9 +73,10 @@ def _boxes(problem: Problem) -> tuple[list[DrawnRegion], list[Constraint]]:
     # A box is stored as bounds of single coordinates.
     sides: dict[int, dict[int, Band]] = {}
     for c in problem.constraints:
-        along = np.flatnonzero(c.coefficients) if isinstance(c, Band) and c.kind == "plane" else ()
-        if isinstance(c, Band) and len(along) == 1 and c.coefficients[along[0]] == 1.0 and not np.ndim(c.lower):
-            sides.setdefault(c.target, {})[int(along[0])] = c
+        if isinstance(c, Band) and c.kind == "plane" and not np.ndim(c.lower):
+            along = np.flatnonzero(c.coefficients)
+            if len(along) == 1 and c.coefficients[along[0]] == 1.0:
+                sides.setdefault(c.target, {})[int(along[0])] = c
     boxes, drawn = [], set()
     for bands in sides.values():
         bounds = [(float(bands[i].lower), float(bands[i].upper)) for i in (0, 1) if i in bands]
@@ -118,6 +120,17 @@ class _Plan:
                     yield from self.shapes(band)
         elif np.ndim(c.lower) == np.ndim(c.upper) == 0 and c.other is None:
             yield from self._of_band(c)
+
+    def fence(self, fence: Fence) -> Iterator[DrawnRegion]:
+        """Yield the stated line of a fence, and the lines one standard deviation beside it."""
+        if np.ndim(fence.offset):
+            return
+        place, sigma = float(fence.offset), float(fence.sigma)
+        line = self._line(fence.normal, place, -1.0)
+        beside = [each for more in (-sigma, sigma) for each in self._line(fence.normal, place + more, -1.0)]
+        if line:
+            yield DrawnRegion("limit", tuple(line), "fence, ticks on the improbable side")
+            yield DrawnRegion("inside", tuple(beside), "fence, one standard deviation")
 
     def _of_band(self, band: Band) -> Iterator[DrawnRegion]:
         """Yield the shapes of a band with one pair of bounds."""

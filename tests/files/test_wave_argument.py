@@ -1,0 +1,97 @@
+"""The argument `wave_speed` of `optloc.locate`."""
+
+import numpy as np
+import pytest
+
+import optloc
+from optloc import InvalidProblem, locate
+from optloc.base.units import SPEED_OF_LIGHT
+from optloc.files.wave_argument import Wave, check_times, wave_of
+from optloc.models import Layers
+
+PLACES = {"A": (0.0, 0.0), "B": (0.0, 20.0), "C": (20.0, 20.0), "D": (20.0, 0.0)}
+
+
+def arrivals(speed):
+    """Return times of arrival from (5, 8), seconds."""
+    return {name: 1.0 + float(np.hypot(x - 5.0, y - 8.0)) / speed for name, (x, y) in PLACES.items()}
+
+
+@pytest.mark.parametrize(
+    ("stated", "speed"),
+    [
+        ("air:20C", 343.2146),
+        ("air:20C,50%", 343.98689),
+        ("water:8C,35,50m", 1483.304),
+        ("1481 m/s", 1481.0),
+        (1481.0, 1481.0),
+        ("343+-5 m/s", 343.0),
+        (("343 m/s", "5 m/s"), 343.0),
+    ],
+)
+def test_every_form_gives_the_position(stated, speed):
+    fix = locate(PLACES, toa=arrivals(speed), sigma="0.1 ms", wave_speed=stated)
+    assert fix.position == pytest.approx([5.0, 8.0], abs=1e-3)
+
+
+def test_a_profile_and_light_are_stated_by_text(tmp_path):
+    path = tmp_path / "profile.csv"
+    path.write_text("depth_m,speed_m_s\n0,1500\n100,1490\n")
+    assert isinstance(wave_of(str(path)).medium, Layers)
+    assert wave_of("light") == Wave(SPEED_OF_LIGHT)
+    assert wave_of(None) == Wave(SPEED_OF_LIGHT, stated=False)
+
+
+def test_the_old_name_still_works_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="argument speed is wave_speed now"):
+        fix = locate(PLACES, toa=arrivals(343.0), sigma="0.1 ms", speed=343.0)
+    assert fix.position == pytest.approx([5.0, 8.0], abs=1e-3)
+    with pytest.raises(TypeError, match="give one of them"):
+        locate(PLACES, toa=arrivals(343.0), sigma="0.1 ms", speed=343.0, wave_speed=343.0)
+
+
+def test_a_missing_speed_is_asked_for():
+    with pytest.raises(InvalidProblem, match='state the speed, such as wave_speed="air:20C"') as caught:
+        locate(PLACES, toa=arrivals(343.0), sigma="0.1 ms")
+    assert len(str(caught.value)) <= 200
+    with pytest.raises(InvalidProblem, match="wave_speed="):
+        locate(PLACES, ranges={"A": 20.0, "B": 30.0, "C": 40.0, "D": 50.0}, unit="ms", sigma="0.1 ms")
+    # arrivals that are equal: only their noise shows that they are not of light
+    with pytest.raises(InvalidProblem, match="wave_speed="):
+        locate(PLACES, toa=dict.fromkeys(PLACES, 1.0), sigma="0.1 ms")
+    check_times("toa", np.array([0.0, 3e4]), 3e4, 20.0, Wave(SPEED_OF_LIGHT))  # light is stated
+
+
+def test_a_wrong_unit_of_light_is_still_a_wrong_unit():
+    with pytest.raises(InvalidProblem, match="unit='ns'"):
+        locate(PLACES, toa={"A": 0.0, "B": 20.0, "C": 40.0, "D": 30.0}, unit="us", sigma="1 ns")
+
+
+@pytest.mark.parametrize("given", [-3.0, 0.0, True, "fast", "343 ns", (1.0, 2.0, 3.0), (343.0, -5.0), object(), np.nan])
+def test_other_values_are_refused(given):
+    with pytest.raises(InvalidProblem) as caught:
+        wave_of(given)
+    assert caught.value.where == "wave_speed"
+    assert len(str(caught.value)) <= 200
+
+
+def test_tables_in_long_form_take_the_same_texts():
+    rows = {"a": list(PLACES), "z": list(arrivals(343.2146).values())}
+    stated = {"kind": "toa", "unit": "s", "sigma": "0.1 ms"}
+    problem = optloc.from_table(rows, PLACES, wave_speed="air:20C", **stated)
+    assert optloc.solve(problem).position == pytest.approx([5.0, 8.0], abs=1e-3)
+    with pytest.warns(DeprecationWarning, match="argument propagation_speed is wave_speed now"):
+        again = optloc.from_table(rows, PLACES, propagation_speed=343.2146, **stated)
+    assert again.z == pytest.approx(problem.z, rel=1e-6)
+    with pytest.raises(InvalidProblem, match='wave_speed="air:20C"'):
+        optloc.from_table(rows, PLACES, **stated)
+
+
+def test_networks_take_times_with_a_wave_speed():
+    times = np.array([[0.01, 0.02, 0.03], [0.02, 0.02, np.nan]])
+    net = optloc.sites.calibration.network_of(times, 1e-4, dimension=2, wave_speed="air:20C")
+    again = optloc.sites.calibration.network_of(343.21462268 * times, 0.0343214623, dimension=2)
+    assert net.z == pytest.approx(again.z)
+    assert net.sigma == pytest.approx(again.sigma)
+    with pytest.raises(InvalidProblem, match="the speed of a network is exact"):
+        optloc.sites.calibration.network_of(times, 1e-4, dimension=2, wave_speed="343+-5 m/s")
