@@ -125,8 +125,7 @@ def run_fix(
     level = rescaled or _level_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
     signals = signals or _late_of(found)
-    told = {check.name for check in CHECKS} if loaded.warnings else set()  # these sentences are printed before the fix
-    advice = tuple(one for one in advice_for_fixes(found) if one.cause not in told)
+    advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
@@ -400,7 +399,10 @@ def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
     if bool((found.fix.code == Status.OK).all()):
         return ()
     problem = found.loaded.problem
-    return advice_for_vectors(problem, found.fix.x) if found.apart else tuple(advise(problem, found.fix))
+    advice = advice_for_vectors(problem, found.fix.x) if found.apart else tuple(advise(problem, found.fix))
+    # The warnings of physical checks are printed before the fix.
+    told = {check.name for check in CHECKS} if found.loaded.warnings else set()
+    return tuple(one for one in advice if one.cause not in told)
 
 
 def advice_for_vectors(problem: Problem, vectors: Array | None) -> tuple[Advice, ...]:

@@ -60,7 +60,7 @@ def test_a_table_a_file_and_locate_warn_of_centimetres_with_their_own_option(fol
 
 def test_json_has_the_warnings_and_advice_does_not_repeat_them(folder):
     write(folder, 1000.0)
-    answer = json.loads(fix("--json").output)
+    answer = json.loads(fix("--json").stdout)
     assert [text[:38] for text in answer["warnings"]] == ["the range values are 1000 times too la"]
     assert "size" not in [one["cause"] for one in answer["advice"]]
 

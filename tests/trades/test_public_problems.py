@@ -27,8 +27,8 @@ def written(name, head, rows):
 def fixed(*words):
     """Return the single fix of a command as JSON; the command may end with a status other than ok."""
     result = CliRunner().invoke(app, ["fix", *words, "--json"])
-    assert result.output.startswith("{"), result.output
-    return json.loads(result.output)["fixes"][0]
+    assert result.stdout.startswith("{"), result.output
+    return json.loads(result.stdout)["fixes"][0]
 
 
 def test_three_listening_stations_and_an_explosion(tmp_path, monkeypatch):
