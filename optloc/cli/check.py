@@ -165,6 +165,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "moving_stations": _count_moving(problem.stations),
         "station_errors": _errors(problem),
         **({} if problem.medium is None else {"medium": problem.medium.words}),
+        **({"wave_speed": loaded.speed} if loaded.speed and problem.medium is None else {}),
         "epochs": problem.epochs,
         "duration_s": float(np.ptp(loaded.times)),
         "targets": len(set(loaded.targets)),

@@ -144,3 +144,17 @@ def test_a_network_that_is_open_is_no_site(folder):
     assert done.exit_code == 1
     assert "too few rows" in done.output
     assert run("calibrate", folder / "hall.toml", "--out", folder / "site.toml").exit_code == 2
+
+
+def test_the_wave_speed_of_a_network_is_an_option(folder):
+    text = (folder / "hall.toml").read_text().replace('sigma = "3 cm"', 'unit = "s"\nsigma = "0.1 ms"')
+    (folder / "hall.toml").write_text(text)
+    by_option = read_network(folder / "hall.toml", "air:20C")
+    (folder / "hall.toml").write_text(text.replace("format = 1", 'format = 1\npropagation_speed = "air:20C"'))
+    by_key = read_network(folder / "hall.toml")
+    assert by_option.z == pytest.approx(by_key.z)
+    assert by_option.sigma.min() == pytest.approx(0.0343215, rel=1e-4)
+    for speed, words in (("343+-5 m/s", "the speed of a network is exact"), ("warm", "no wave speed")):
+        done = run("calibrate", folder / "hall.toml", "--wave-speed", speed)
+        assert done.exit_code == 2
+        assert words in done.stderr
