@@ -50,10 +50,14 @@ def deviation():
 
 # Regions with the target k standard deviations inside their bound, which is across the first coordinate.
 REGIONS = {
-    "disc": lambda k: constraints.disc(TARGET - [40.0 - k, 0.0], 40.0),
-    "keep-out disc": lambda k: constraints.keep_out_disc(TARGET + [40.0 + k, 0.0], 40.0),
-    "keep-out polygon": lambda k: constraints.keep_out_polygon(TARGET + [[k, -200.0], [60.0, 0.0], [k, 200.0]]),
-    "polyline": lambda k: constraints.polyline(TARGET + [[-25.0 + k, -200.0], [-25.0 + k, 0.0], [-90.0, 200.0]], 25.0),
+    "disc": lambda k: constraints.disc(TARGET - np.array([40.0 - k, 0.0]), 40.0),
+    "keep-out disc": lambda k: constraints.keep_out_disc(TARGET + np.array([40.0 + k, 0.0]), 40.0),
+    "keep-out polygon": lambda k: constraints.keep_out_polygon(
+        TARGET + np.array([[k, -200.0], [60.0, 0.0], [k, 200.0]])
+    ),
+    "polyline": lambda k: constraints.polyline(
+        TARGET + np.array([[-25.0 + k, -200.0], [-25.0 + k, 0.0], [-90.0, 200.0]]), 25.0
+    ),
 }
 
 
@@ -69,9 +73,9 @@ def test_the_region_at_a_bent_bound_holds_the_target(name, n):
 
 
 EQUALITIES = {
-    "circle": constraints.annulus(TARGET - [30.0, 40.0], 50.0, 50.0),
+    "circle": constraints.annulus(TARGET - np.array([30.0, 40.0]), 50.0, 50.0),
     "far disc": constraints.disc(TARGET, 200.0),
-    "far road": constraints.polyline(TARGET + [[-300.0, -300.0], [-90.0, 0.0], [300.0, 300.0]], 200.0),
+    "far road": constraints.polyline(TARGET + np.array([[-300.0, -300.0], [-90.0, 0.0], [300.0, 300.0]]), 200.0),
 }
 
 
@@ -118,7 +122,7 @@ def test_the_bound_on_a_ground_is_that_of_its_tangent():
 
 
 def test_the_bound_of_two_targets_at_a_known_distance_is_that_of_its_tangent():
-    truth = np.concatenate([TARGET, TARGET + [30.0, 40.0]])
+    truth = np.concatenate([TARGET, TARGET + np.array([30.0, 40.0])])
     z = np.concatenate([np.linalg.norm(PLANE - place, axis=1) for place in truth.reshape(2, 2)])
     rows = measured("range", z, a=[0, 1, 2, 3] * 2, target=[0] * 4 + [1] * 4, sigma=SIGMA)
     limits = constraints.separation(0, 1, 50.0, 50.0)
