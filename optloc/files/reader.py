@@ -25,6 +25,7 @@ from optloc.files.constraint_reader import (
     StatedConstraints,
     constraints_of,
     demands_of,
+    divided,
     limits_of,
     stated_arguments,
 )
@@ -296,8 +297,8 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
-    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
+    limits, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
+    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, **divided(limits))
     check_budget("unknowns", made.layout.n_shared, source)
     return _check(made, source, medium_in(file, source))
 
@@ -580,8 +581,7 @@ def from_table(
     InvalidProblem
         The message names the row and column.
     """
-    names = dict(columns or {})
-    settings_of_stations: Any = station_options or {}
+    names, settings_of_stations = dict(columns or {}), dict[str, Any](station_options or {})
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
     places = station_table(stations, "stations", names=settings_of_stations.get("columns"))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
@@ -590,7 +590,7 @@ def from_table(
         "format": 1,  # keeps the convention of azimuths of this function
         "propagation_speed": propagation_speed,
         "frame": place,
-        "stations": dict(settings_of_stations),
+        "stations": settings_of_stations,
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},
