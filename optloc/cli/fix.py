@@ -19,6 +19,7 @@ from optloc.cli.file_fixes import (
     FileFixes,
     fix_file,
     fixes_json,
+    in_unit_of_stations,
     results_of,
 )
 from optloc.cli.from_table import read_problem
@@ -192,6 +193,12 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
         table.add_row(*row)
     console.print(table)
     _show_sheet(bias_sheet(fix, found.seen, found.loaded.bias_unit), console)
+    converted = in_unit_of_stations(found.loaded, found.columns)
+    if converted and len(found.columns["x"]) == 1 and np.isfinite(found.columns["x"]).all():
+        parts = [(*name.split("_", 1), float(values[0])) for name, values in converted.items()]
+        say(
+            console, "The position is " + ", ".join(f"{axis} = {value:.6g} {unit}" for axis, unit, value in parts) + "."
+        )
     say_all(console, () if found.seen is None else found.seen.sentences)
     _show_sheet(suspect_sheet(fix), console)
     _show_unnoticed(found, fix, console)

@@ -85,9 +85,14 @@ class TableProblem:
 
     @property
     def as_read(self) -> dict[str, Any]:
-        """Return the interpretation of the table as a JSON value."""
+        """Return the interpretation of the table as a JSON value.
+
+        It has the unit of the stations if results in it are expected: not metres, and not on Earth.
+        """
         pairs = [list(pair) for pair in self.about]
-        return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
+        other = self.places.unit if self.places.frame == "cartesian" and self.places.unit != "m" else None
+        found = {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
+        return found if other is None else found | {"unit": other}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
         """Return the problem, equal to the problem that `read` returns for the written files.
