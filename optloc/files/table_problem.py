@@ -103,7 +103,9 @@ class TableProblem:
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
         loaded = assemble(file, stations, tables, out.name, values=True, more=more).loaded
-        return replace(loaded, source=self.source.name, table=self.as_read)
+        # of S minus P, the report names the speeds of both waves
+        speed = loaded.speed if any(word == "wave" for word, _ in self.about) else ""
+        return replace(loaded, source=self.source.name, table=self.as_read, speed=speed)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file and its tables, and return their paths."""
