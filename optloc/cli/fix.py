@@ -33,6 +33,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.constraint_table import ConstraintTable
+from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
@@ -184,7 +185,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
-    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed else []
+    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed not in ("", NOT_STATED) else []
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
     colour = _CARE if fix.unchecked and fix.status is Status.OK else _colour(Status(int(fix.code)))
     table.add_row("status", Text(rows[0][1], style=f"bold {colour}"))
