@@ -107,8 +107,7 @@ def run_fix(
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
-    loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
-    loaded = replace(loaded, floors=floors)
+    loaded = replace(read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output), floors=floors)
     claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
@@ -124,9 +123,8 @@ def run_fix(
     if quiet and not as_json:
         return 0 if found.passes(allow) else 1
     # the search for causes takes time, so do it only if the result is printed
-    level = rescaled or _level_of(found)
+    level, signals = rescaled or _level_of(found), signals or _late_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
-    signals = signals or _late_of(found)
     advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
