@@ -344,15 +344,19 @@ class PosedProgram(Posed):
 
         `duals` are first multipliers; None for none.
         """
+        import casadi as ca
+
         from formulations.backend import Choice, SolverError
 
+        if not ca.has_nlpsol(name):  # without this question, CasADi would print all folders that it searches
+            raise InvalidProblem(f"CasADi has no nonlinear solver {name!r}", "solver", "see 'optloc list solvers'")
         choice = None if name == "ipopt" else Choice("nonlinear", name, settings)
         try:
             program = Program.of(self._program, self._statement, choice=choice, settings=settings)
-        except RuntimeError as trouble:
-            text = str(trouble).partition("\n")[0][:200]
+        except RuntimeError:  # CasADi raises no other type
+            given = ", ".join(settings)
             raise InvalidProblem(
-                f"CasADi cannot use {name!r} with these settings: {text}", "solver", "see optloc list solvers"
+                f"{name} does not accept the settings {given}", "settings", "check their names"
             ) from None
         own, ends, failure = self._own, list[Local](), ""
         multipliers = None if duals is None else (np.zeros(program.n), self._multipliers(duals))
@@ -380,14 +384,19 @@ class PosedProgram(Posed):
 
     def _vector_of(self, start: Any) -> Array:
         """Return a vector (size,) in SI units from an earlier fix, a vector or a position."""
-        value = np.asarray(start.x if isinstance(start, Fix) else self._of_answer(start), dtype=float).ravel()
+        try:
+            value = np.asarray(start.x if isinstance(start, Fix) else self._of_answer(start), dtype=float).ravel()
+        except (TypeError, ValueError):
+            raise InvalidProblem(
+                "start is no vector of numbers", "start", "give a fix, a vector or a position"
+            ) from None
         size, layout = self._program.n, self._own.problem.layout
         if len(value) == size:
             return value
         if len(value) == layout.n_shared:
             return np.asarray(complete(self._own.problem, value[None, None])[0, 0], dtype=float)
         if len(value) == len(self.origin):
-            out = self._candidates()[0].copy()
+            out: Array = self._candidates()[0].copy()
             slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
             out[slot.start : slot.start + slot.size] = value
             return out
@@ -405,6 +414,9 @@ class PosedProgram(Posed):
         """Return the multipliers (equalities, inequalities) of named duals; zeros for the other constraints."""
         first: list[float] = []
         second: list[float] = []
+        unknown = [name for name in duals if name not in self.relations]
+        if unknown:
+            raise InvalidProblem(f"there is no constraint {unknown[0]!r}", "duals", "use fix.posed.duals")
         for name, one in self.relations.items():
             given = np.ravel(duals.get(name, np.zeros(len(one.parts))))
             if len(given) != len(one.parts):

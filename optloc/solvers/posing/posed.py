@@ -174,6 +174,8 @@ class Posed(ABC):
             name = next(
                 text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
             )
+        if not isinstance(name, str):
+            raise InvalidProblem(f"the name {name!r} is no text", "name", "give a text such as 'fence'")
         if name in self.relations:
             raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
         return name

@@ -69,8 +69,14 @@ def test_what_cannot_be_added_or_minimised():
     for goal, what in ((posed.residual, "not a scalar"), (ca.SX(2.0), "no unknown"), ("cost", "no expression")):
         with pytest.raises(InvalidProblem, match=what):
             posed.minimise(goal)
-    with pytest.raises(InvalidProblem, match="cannot use 'nosuch'"):
+    with pytest.raises(InvalidProblem, match="no nonlinear solver 'nosuch'"):
         posed.solve("nosuch")
+    with pytest.raises(InvalidProblem, match="does not accept the settings"):
+        posed.solve(settings={"nosuch": 1})
+    with pytest.raises(InvalidProblem, match="no constraint 'other'"):
+        posed.solve(duals={"other": 1.0})
+    with pytest.raises(InvalidProblem, match="no vector of numbers"):
+        posed.solve(start="here")
     with pytest.raises(InvalidProblem, match="start has 5 numbers"):
         posed.solve(start=np.zeros(5))
     with pytest.raises(InvalidProblem, match="union"):
