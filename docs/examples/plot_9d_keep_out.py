@@ -2,8 +2,8 @@
 Outside an island
 =================
 
-Six ranges locate a ship near an island. The fix without the constraint is on land. With the keep-out polygon, the fix
-is on the coast with the least chi-square. The right map shows it with its 95 % region.
+Six ranges locate a ship near an island. The keep-out polygon excludes the land, so the 95 % region ends at the coast.
+The fix lists a second position, on the north coast, with its additional cost.
 """
 
 import numpy as np

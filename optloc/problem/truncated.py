@@ -277,7 +277,8 @@ class Truncated:
 
     def _inside(self, points: Array) -> Array:
         """Return flags (...) of admitted points (..., d), metres from the fix, by the function of one distribution."""
-        function: Any = self.region
+        # One distribution taken out of a batch has its function in an array without axes.
+        function: Any = self.region[()] if isinstance(self.region, np.ndarray) else self.region
         return np.asarray(function(points))
 
     def _parts(self, step: Array, length: Array) -> tuple[Array, Array, Array]:
