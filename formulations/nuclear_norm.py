@@ -28,6 +28,7 @@ norm regularization", Proc. ICASSP 2013 (the truncated norm for times of emissio
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,28 +136,41 @@ def nuclear_offsets(z: ArrayLike, d: int, *, passes: int = 20, backend: str = "C
     -----
     Fazel (2002); Jiang, Kuang and Astrom (2013). Built once per size and back end in each process.
     """
-    given = np.asarray(z, dtype=np.float64)
-    unit = power_of_two(float(np.sqrt((given * given).mean())))
-    Z = given.T / unit
-    m, n = Z.shape
-    left, right = _centring_columns(m), _centring_columns(n)
-    squares, factor = left.T @ (Z * Z) @ right, left.T @ Z
+    data, unit = nuclear_data(z)
+    n, m = np.shape(z)
+    squares, factor, right = data["squares"], data["factor"], _centring_columns(n)
     relaxation = _relaxation(m, n, backend)
     slope, before, bound = np.zeros(n), np.full(n, np.inf), -np.inf
     for made in range(1, passes + 1):
-        values = {"squares": squares, "factor": factor, "slope": slope, "most": Z.min(axis=0)}
-        answer = relaxation.solve(values, bound=made == 1)
+        answer = relaxation.solve({**data, "slope": slope}, bound=made == 1)
         offset = answer.values["offset"]
         bound = answer.bound * unit**2 if made == 1 else bound
         G = squares - 2.0 * (factor * offset) @ right
         if not np.isfinite(G).all():
             return NuclearNorm(unit * offset, np.nan, bound, np.nan, made, answer)
-        u, s, v = np.linalg.svd(G, full_matrices=False)
+        s = np.linalg.svd(G, compute_uv=False)
         if np.abs(offset - before).max() < _SETTLED:
             break
-        # d/do of <W, G(o)>
-        slope, before = -2.0 * np.einsum("pj,pq,jq->j", factor, u[:, :d] @ v[:d], right), offset
+        slope, before = truncated_slope(data, offset, d), offset
     return NuclearNorm(unit * offset, float(s.sum()) * unit**2, bound, float(s[d:].sum() / s.sum()), made, answer)
+
+
+def nuclear_data(z: ArrayLike) -> tuple[dict[str, Array], float]:
+    """Return the parameters of the first pass for arrivals (N, M), by name, and the unit of length."""
+    given = np.asarray(z, dtype=np.float64)
+    unit = power_of_two(float(np.sqrt((given * given).mean())))
+    Z = given.T / unit
+    left, right = _centring_columns(len(Z)), _centring_columns(Z.shape[1])
+    squares, factor = left.T @ (Z * Z) @ right, left.T @ Z
+    return {"squares": squares, "factor": factor, "slope": np.zeros(Z.shape[1]), "most": Z.min(axis=0)}, unit
+
+
+def truncated_slope(data: Mapping[str, Array], offset: Array, d: int) -> Array:
+    """Return the derivative (N,) of the d largest singular values by scaled times of emission `offset` (N,)."""
+    right = _centring_columns(len(offset))
+    u, _, v = np.linalg.svd(data["squares"] - 2.0 * (data["factor"] * offset) @ right, full_matrices=False)
+    # d/do of <W, G(o)>
+    return np.asarray(-2.0 * np.einsum("pj,pq,jq->j", data["factor"], u[:, :d] @ v[:d], right), dtype=np.float64)
 
 
 def affine_network(z: ArrayLike, offset: ArrayLike, d: int) -> LowRank:

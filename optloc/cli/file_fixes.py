@@ -223,6 +223,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
         "file": found.loaded.source,
         "title": found.loaded.title,
         **table_json(found.loaded),
+        **({"warnings": list(found.loaded.warnings)} if found.loaded.warnings else {}),
         "frame": {"kind": frame.kind, "origin_deg": origin},
         "fixes": [row | detail for row, detail in zip(rows, per_fix, strict=True)] if single else rows,
         "runs": [] if single else per_fix,

@@ -40,6 +40,7 @@ from optloc.model_checks.advice import advise, advise_at, explained_at
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
 from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.model_checks.plausibility import CHECKS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, records
@@ -398,7 +399,10 @@ def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
     if bool((found.fix.code == Status.OK).all()):
         return ()
     problem = found.loaded.problem
-    return advice_for_vectors(problem, found.fix.x) if found.apart else tuple(advise(problem, found.fix))
+    advice = advice_for_vectors(problem, found.fix.x) if found.apart else tuple(advise(problem, found.fix))
+    # The warnings of physical checks are printed before the fix.
+    told = {check.name for check in CHECKS} if found.loaded.warnings else set()
+    return tuple(one for one in advice if one.cause not in told)
 
 
 def advice_for_vectors(problem: Problem, vectors: Array | None) -> tuple[Advice, ...]:

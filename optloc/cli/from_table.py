@@ -234,7 +234,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
     if out is None:
         table_problem = interpret_table(file, hints)
         _print_interpretation(table_problem, console)
-        table_problem.read()
+        print_warnings(table_problem.read(), console)
         say_next(
             console,
             f"Nothing is written. To write a problem file, add --out; to fix the table itself, use optloc fix {file}.",
@@ -251,6 +251,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         say_all(console, found.notes)
         say_next(console, f'{out} is a table of stations. In a problem file, write [stations] file = "{out.name}".')
     else:
+        print_warnings(found.loaded, console)
         problem = found.loaded.problem
         summary = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
         say_next(console, f"{', '.join(map(str, found.written))}: {summary}. Next: optloc check {out}.")
@@ -324,14 +325,26 @@ def read_problem(
     constraints by the name of their option. `values` requires measured values in a problem file. `hints` has the column
     hints of a table, or the options on the wave of a problem file.
     """
+    from optloc.cli.output import Screen
     from optloc.files.reader import read
     from optloc.files.wave_speed import WaveOptions
 
+    console = Screen(quiet=quiet, stderr=on_error)
     if hints is None or isinstance(hints, WaveOptions):
-        return read(file, values=values, more=more, wave=hints)
-    from optloc.cli.output import Screen
-    from optloc.files.convert import interpret_table
+        loaded = read(file, values=values, more=more, wave=hints)
+    else:
+        from optloc.files.convert import interpret_table
 
-    table_problem = interpret_table(file, hints)
-    _print_interpretation(table_problem, Screen(quiet=quiet, stderr=on_error))
-    return table_problem.read(more or {})
+        table_problem = interpret_table(file, hints)
+        _print_interpretation(table_problem, console)
+        loaded = table_problem.read(more or {})
+    print_warnings(loaded, console)
+    return loaded
+
+
+def print_warnings(loaded: Loaded, console: Console) -> None:
+    """Print the sentences on values that are physically suspicious."""
+    from optloc.cli.output import say
+
+    for sentence in loaded.warnings:
+        say(console, f"Warning: {sentence}.")

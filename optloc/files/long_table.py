@@ -103,4 +103,4 @@ def from_table(
     }
     file, limits = with_profile(validate(settings, "arguments"), None, "arguments"), stated_arguments(constraints)
     rows = [of_frame(table, "table", names)]
-    return assemble(file, places, rows, "arguments", values=values, limits=limits).loaded.problem
+    return assemble(file, places, rows, "arguments", values=values, limits=limits).plausible("file").problem

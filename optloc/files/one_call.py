@@ -18,11 +18,12 @@ from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.moved import renamed
-from optloc.base.types import Amount, Array, Band, Motion, Stations
+from optloc.base.types import Amount, Array, Band, Motion, Stations, Status
 from optloc.base.units import AzimuthConvention, Conversion, Quantity, conversion, in_si
 from optloc.files.by_station import ARGUMENTS, StationValues, station_values
 from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.declination import declination_of, declinations
+from optloc.files.physics import warn_of_values
 from optloc.files.propagation import is_time
 from optloc.files.roles import with_standard_columns
 from optloc.files.schema import FrameTable, StationsTable
@@ -31,6 +32,7 @@ from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
 from optloc.files.wave_argument import Wave, check_times, wave_of, with_speed
 from optloc.linear import constraints
+from optloc.model_checks.plausibility import refuse_impossible
 from optloc.models import MODELS
 from optloc.models.medium import Medium
 from optloc.problem.build import Measured, assemble, measured, station_array
@@ -250,7 +252,10 @@ def locate(
         _problem_of(stations, latlon, given, sigma, unit, reference, level, constraints, frame, wave, north)
         for level in floors or [height]
     ]
+    refuse_impossible(made[0][0], lambda _: "ranges", "python")
     fix = solve_on_floors([problem for problem, _ in made], method) if floors else solve(made[0][0], method=method)
+    if (np.asarray(fix.code) != Status.OK).any():  # values of another unit fit no position, so these checks may wait
+        warn_of_values(made[0][0], unit, "toa" in given, wave.speed)
     return _labelled(fix, made[0][1])
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from optloc.files.constraint_reader import (
     Demand,
     constraints_of,
     demands_of,
+    divided,
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
@@ -33,10 +34,11 @@ from optloc.files.measurements import (
     chunks_of,
     declination_text,
     square,
-    with_baseline,
     with_declination,
+    with_station_distance,
 )
 from optloc.files.phase_rows import combined_noise, split_phases
+from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
 from optloc.files.schema import ProblemFile, name_of, read_document
@@ -93,6 +95,8 @@ class Loaded:
         Convention of azimuths, and the setting that changes it; empty without azimuths.
     table : mapping
         Interpretation of a measurement table, as a JSON value; empty for a problem file.
+    warnings : tuple of str
+        Sentences on values that are physically suspicious.
     speed : str
         Wave speed, as text; empty if no value depends on it.
     floors : tuple of float
@@ -110,6 +114,7 @@ class Loaded:
     bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     azimuths: str = ""
     table: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     speed: str = ""
     floors: tuple[float, ...] = ()
 
@@ -144,6 +149,11 @@ class Draft:
     chunks: tuple[RowChunk, ...]
     numbers: tuple[Array, ...]
     moving: bool
+
+    def plausible(self, surface: str) -> Loaded:
+        """Return the problem with warnings on suspicious values; raise InvalidProblem for impossible values."""
+        found = warnings_of(self.loaded.problem, self.chunks, self.numbers, surface, self.loaded.source)
+        return replace(self.loaded, warnings=found)
 
 
 def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:
@@ -192,7 +202,7 @@ def read(
     InvalidProblem
         As in `load`.
     """
-    loaded = draft(Path(path), values=values, more=more or {}, wave=wave).loaded
+    loaded = draft(Path(path), values=values, more=more or {}, wave=wave).plausible("file")
     p = loaded.problem
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
@@ -271,7 +281,7 @@ def assemble(
     )
     check_speed(file, chunks, groups, stations, source)
     # Convert excess paths to path sums now, since the station positions are known.
-    pairs = [(_add_baseline(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
+    pairs = [(with_station_distance(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
     chunks, index, target = split_phases(chunks, index, target, source)
     azimuths += declination_text(chunks) if azimuths else ""
@@ -315,8 +325,8 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
-    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
+    limits, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
+    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, **divided(limits))
     check_budget("unknowns", made.layout.n_shared, source)
     return _check(made, source, medium_in(file, source, frame, stations))
 
@@ -351,15 +361,6 @@ def _stations_used(chunk: RowChunk, epoch: Array) -> Array:
     """Return the pairs (epoch, station) (u, 2) whose position the present rows of a chunk need."""
     pairs = [np.stack([epoch, station], axis=-1)[(station >= 0) & (chunk.weight > 0)] for station in (chunk.a, chunk.b)]
     return np.concatenate(pairs)
-
-
-def _add_baseline(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
-    """Return a chunk with excess paths converted to path sums: the distance of the stations is added."""
-    if not chunk.excess:
-        return chunk
-    place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
-    rows = np.arange(len(epoch))
-    return with_baseline(chunk, np.linalg.norm(place[rows, chunk.a] - place[rows, chunk.b], axis=-1))
 
 
 def _rows(

@@ -112,6 +112,7 @@ def station_table(
         keys = dict.fromkeys(key for row in rows for key in row)
         columns = {key: np.array([row.get(key) for row in rows], dtype=object) for key in keys}
         return of_frame({"name": np.array([str(name) for name in given], dtype=object)} | columns, where, names)
+    _check_heights(given, where)
     try:
         place = np.array([np.asarray(row, dtype=float) for row in rows])
     except (TypeError, ValueError):
@@ -121,6 +122,16 @@ def station_table(
         raise InvalidProblem(what, where, "give name: (x, y, z), or an array with a row for each station")
     labels = np.array([str(name) for name in given] if mapped else [f"S{i}" for i in range(len(place))], dtype=object)
     return of_frame({"name": labels} | dict(zip(axes, place.T, strict=False)), where, names)
+
+
+def _check_heights(given: Any, where: str) -> None:
+    """Raise InvalidProblem if some stations of a mapping or sequence have a height and others have none."""
+    rows = given.items() if isinstance(given, Mapping) else ((f"S{i}", row) for i, row in enumerate(given))
+    count = {str(name): np.size(row) for name, row in rows}
+    flat = [name for name, n in count.items() if n == 2]
+    if flat and 3 in count.values():
+        what = f"{len(flat)} of {len(count)} stations have no height, the first is {flat[0]}"
+        raise InvalidProblem(what, where, "give every station three coordinates, or every station two")
 
 
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:

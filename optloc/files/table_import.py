@@ -460,7 +460,8 @@ def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, wher
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     unit_in_name = unit_of(column, known)
     if hints.unit is not None and hints.unit in known:
-        return hints.unit, ""
+        note = f"--unit {hints.unit} replaces {unit_in_name} of the column name; remove it if the name is right"
+        return hints.unit, note if unit_in_name not in (None, hints.unit) else ""
     if hints.unit is not None and (unit_in_name is None or not any(hints.unit in table for table in UNITS.values())):
         raise InvalidProblem(f"{hints.unit!r} is not a unit of {form.text}", "--unit", nearest(hints.unit, list(known)))
     if unit_in_name is not None:

@@ -105,8 +105,9 @@ class TableProblem:
         file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
-        loaded = assemble(file, stations, tables, out.name, values=True, more=more).loaded
-        return replace(loaded, source=self.source.name, table=self.as_read)
+        made = assemble(file, stations, tables, out.name, values=True, more=more)
+        loaded = replace(made, loaded=replace(made.loaded, source=self.source.name)).plausible("table")
+        return replace(loaded, table=self.as_read)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file and its tables, and return their paths."""

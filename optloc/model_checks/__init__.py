@@ -11,6 +11,11 @@ if TYPE_CHECKING:
     from optloc.model_checks.evidence import Reliability as Reliability, reliability as reliability
     from optloc.model_checks.geometry import Advice as Advice
     from optloc.model_checks.noise_level import CommonLevel as CommonLevel, LateSignals as LateSignals
+    from optloc.model_checks.plausibility import (
+        least_values as least_values,
+        refuse_impossible as refuse_impossible,
+        suspicious_values as suspicious_values,
+    )
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -14,6 +14,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.model_checks.geometry import Advice, advise_on_geometry
+from optloc.model_checks.plausibility import CHECKS, suspicious_values
 from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.model_checks.unit_mistakes import advise_on_values
 from optloc.problem.bias import family
@@ -22,6 +23,8 @@ from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
+# Causes of advice on values that propose no other reading of the values, so that a systematic error may explain them.
+_NO_READING = ("impossible", "constraint", *(check.name for check in CHECKS))
 # Largest number of explanations of a misfit that are listed if several fit equally well.
 _MAX_ERRORS = 3
 # Largest number of rows of a run that are tested: lasting errors are visible in them, and tests of all channels of more
@@ -81,11 +84,11 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     problem, x = _shortened(*_without_unknown(flat, x))
     if not bool((problem.weight > 0.0).any()):
         return tuple(found)
-    values = list(advise_on_values(problem, x))
+    values = [*suspicious_values(problem), *advise_on_values(problem, x)]
     if not np.isfinite(x).all() and one_place(problem):
         x = fit_anywhere(problem).x
     # if another unit, sign or convention explains the values, no systematic error is needed
-    read = any(one.cause not in ("impossible", "constraint") for one in values)
+    read = any(one.cause not in _NO_READING for one in values)
     errors = [] if read else [_error_advice(problem, one) for one in explain_misfit(problem, x)[:_MAX_ERRORS]]
     return (*values, *errors, *found)
 

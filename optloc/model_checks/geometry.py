@@ -26,7 +26,8 @@ class Advice:
     ----------
     cause : str
         A keyword for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
-        "impossible", "constraint", "offset", "scale", "rotation", "drift", "step" or "burst".
+        "impossible", "constraint", "size", "slant", "height", "wrap", "offset", "scale", "rotation", "drift", "step" or
+        "burst".
     seen : str
         The observation, a sentence without its full stop.
     advice : str

@@ -29,6 +29,8 @@ from optloc.problem.problem import Problem
 _MISFIT, _FITS = 1e-4, 1e-3
 # Probability, over all readings together, that random values fit with one of the readings.
 _CHANCE = 1e-3
+# The same for the opposite sign, the only alternative of its sort: four receivers in the plane can show it.
+_CHANCE_OF_SIGN = 1e-2
 # Number of standard deviations beyond which a value is impossible.
 _IMPOSSIBLE_SIGMAS = 6.0
 # Number of epochs of a run that are tested: an error of all rows is visible in a few epochs.
@@ -54,7 +56,7 @@ class Reading:
     shift: float
     seen: str
     advice: str
-    toml: str
+    toml: str = ""
 
 
 def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
@@ -130,7 +132,7 @@ def _fitting_readings(problem: Problem) -> Iterator[Advice]:
         # noise that is stated in a separate unit keeps its size; the problem does not hold this unit, so try both
         scaled, stated = _with_reading(problem, one, False), _with_reading(problem, one, True)
         # each reading is tested twice, so the probability of a fit by chance is multiplied by two (Bonferroni)
-        able = [other for other in (scaled, stated) if _chance_of_fit(other) * 2.0 * len(tried) <= _CHANCE]
+        able = [other for other in (scaled, stated) if _chance_of_fit(other) <= _largest_chance(one, len(tried))]
         if not able or _is_impossible(able[0]):
             continue
         p = max(_p_of_best_fit(other) for other in able)
@@ -139,6 +141,11 @@ def _fitting_readings(problem: Problem) -> Iterator[Advice]:
     # feet and nanoseconds are so similar that both may fit: the better fit comes first
     for p, one in sorted(found, key=lambda each: -each[0])[:_MAX_READINGS]:
         yield Advice(one.cause, f"{one.seen} (p = {p:.2g})", one.advice, one.toml)
+
+
+def _largest_chance(reading: Reading, count: int) -> float:
+    """Return the largest probability of a fit by chance at which a reading is reported; `count` is their number."""
+    return _CHANCE_OF_SIGN if reading.cause == "sign" else _CHANCE / (2.0 * count)
 
 
 # Possible readings of the values.
@@ -153,6 +160,9 @@ def _readings(problem: Problem) -> Iterator[Reading]:
             seen = f"the {kind} values fit with the opposite sign"
             advice = "state which station is farther if the number is positive (remove the key if it is there)"
             yield Reading("sign", (kind,), -1.0, 0.0, seen, advice, 'positive = "b-farther"\n')
+        if MODELS[kind].emission:
+            seen = f"the {kind} values fit with the opposite sign: the counters count down to zero"
+            yield Reading("sign", (kind,), -1.0, 0.0, seen, "write a minus before each value")
     for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))):
         yield from _length_units(group) if group else ()
     yield from _angle_readings(angles)

@@ -317,6 +317,7 @@ _KINDS: dict[str, Model] = {
         lifted=_lifted_elevation,
         period=tau,
         axes=True,
+        dimensions=(3,),
         ray=lambda t, a, b: _elevation(arrival(t, a)),
         aliases=("elevation_angle",),
     ),
@@ -327,6 +328,7 @@ _KINDS: dict[str, Model] = {
         "height above the WGS 84 ellipsoid",
         nodes=((1.0, "height"),),
         ecef=True,
+        dimensions=(3,),
         aliases=("altitude",),
     ),
     "range_rate": Model(

@@ -258,8 +258,9 @@ class Truncated:
         factor = factor_of(self.covariance)
         rank = factor.shape[1]
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
-        usual = (_RAYS if self.region is None else _SEARCHED).get(rank, 2)
-        unit, middle = _directions(rank, count or usual), whitener @ self.shift
+        # Rays whose admitted parts are searched cost more, so there are fewer.
+        usual = _RAYS if self.region is None else _SEARCHED
+        unit, middle = _directions(rank, count or usual.get(rank, 2)), whitener @ self.shift
         step, lean = unit @ factor.T, unit @ middle
         # A ray ends where the squared deviation has increased by `_END`.
         length = lean + np.sqrt(lean**2 + _END)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.model_checks import refuse_impossible, suspicious_values
 from optloc.problem import Array, InvalidProblem, Status
 from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
 from optloc.service.events import Event
@@ -33,6 +34,9 @@ PENDING = 256
 
 PHASES = ("two", "one", "fix")
 """Answers of an event: a fix at once and its proof later, both in one answer after the proof, or no proof."""
+
+# Number of groups of events whose values are checked: a wrong unit is the same in all events.
+_CHECKED = 8
 
 Emit = Callable[[Event, Record, bool], None]
 """Receives an event, its answer, and whether it is the last answer."""
@@ -104,6 +108,7 @@ class Engine:
         self._open: deque[Pending] = deque()
         self._changed, self._ends = Condition(), False
         self._thread = Thread(target=self._prove, name="optloc proofs", daemon=True)
+        self._to_check, self._warned = _CHECKED, set[str]()
         ready = site.ready((), site.rows)
         assert ready is not None  # a site has rows
         self.tracks = Tracks(ready.fast.problem, following or Following(), metrics, self._followed, clock)
@@ -223,7 +228,27 @@ class Engine:
         # differences of integers: a float of seconds since 1970 only resolves 70 m
         arrivals = np.array([_since_first(event, receivers) for event in events], dtype=float).reshape(len(events), -1)
         values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
-        return [EventGroup(ready, events, ready.si(arrivals, values))]
+        return self._possible(EventGroup(ready, events, ready.si(arrivals, values)))
+
+    def _possible(self, group: EventGroup) -> list[EventGroup]:
+        """Return the group without impossible events, which are answered; log suspicious values of the first groups."""
+        ready, problem = group.ready, group.ready.fast.problem
+        bad = (group.z < ready.least).any(-1)
+        for i in np.flatnonzero(bad).tolist():
+            try:
+                refuse_impossible(problem.with_rows(z=group.z[i]), lambda _: self.site.source, "live")
+            except InvalidProblem as error:
+                self._fail(group.events[i], str(error))
+        kept = np.flatnonzero(~bad).tolist()
+        if bad.any():
+            group = EventGroup(ready, [group.events[i] for i in kept], group.z[kept])
+        if kept and self._to_check > 0:
+            self._to_check -= 1
+            found = suspicious_values(problem.with_rows(z=group.z), "live", speed=self.site.speed)
+            for one in (one for one in found if one.cause not in self._warned):
+                self._warned.add(one.cause)
+                LOG.warning("%s: %s; %s", self.site.source, one.seen, one.advice)
+        return [group] if kept else []
 
     def _fixed(self, group: EventGroup, phase: str | None) -> list[Record]:
         """Return the answers of the first phase (n); if the solver fails, each answer has the error."""

@@ -33,6 +33,7 @@ from optloc.files import (
     with_options,
     with_profile,
 )
+from optloc.model_checks import least_values
 from optloc.models import MODELS
 from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest, no_station
 from optloc.solvers import Prepared, prepare
@@ -115,6 +116,8 @@ class Ready:
         For each kind of rows with values: their columns, rows of the problem, unit, and the amount to add, SI.
     scale : float
         Metres that the signal travels in a picosecond.
+    least : array (m,)
+        Least possible values of the rows, SI; minus infinity for no limit.
     """
 
     fast: Prepared
@@ -125,6 +128,7 @@ class Ready:
     second: Array
     stated: tuple[tuple[Array, Array, Conversion, Array], ...]
     scale: float
+    least: Array
 
     def si(self, arrivals: Array, values: Array) -> Array:
         """Return the measurements (n, m) of the problem for n events, SI.
@@ -304,7 +308,9 @@ class Site:
         row, first, second = np.array(links, dtype=np.int64).reshape(-1, 3).T
         fast = prepare(bare, FAST)
         full = fast if self.method == FAST else prepare(bare, self.method)
-        return Ready(fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12)
+        return Ready(
+            fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12, least_values(bare)
+        )
 
     def _draft(self, rows: tuple[SiteRow, ...]) -> tuple[Draft, list[list[int]]]:
         """Return the problem of rows, and for each row of its tables the index in `rows`, -1 for a row without a value.

@@ -280,7 +280,7 @@ def _marks_page(
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
         **({"ground tracks": _curves(_nearest_turn(tracks, middle), plane, "line")} if tracks else {}),
-        **({"constraints": _curves(_nearest_turn(shapes, middle), plane)} if shapes else {}),
+        **({"constraints": _curves(_nearest_turn(shapes, middle), plane, "line limit")} if shapes else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
         role: [*_ellipses(marks, plane, middle), *_dots(marks, plane, middle, _MARK if few else _SMALL)],
@@ -293,6 +293,7 @@ def _marks_page(
     text = f"White: stations. Blue: {role}, with 95 % region; orange if not ok. Point at a mark for details."
     if marks.local is not None and marks.local.any():
         text = text.replace("95 % region;", "95 % region (dotted: a local ellipse, not valid);")
+    text += " Brown: limits of the target." if shapes else ""
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])

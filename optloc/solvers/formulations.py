@@ -14,13 +14,13 @@ from optloc.linear.mirror import one_position
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import Reference, reference_bound
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate
 from optloc.solvers.posing.gross_errors import pose_sparse
 from optloc.solvers.posing.moving_stations import pose_doppler, pose_registration
 from optloc.solvers.posing.programs import pose_program, pose_pulses
 from optloc.solvers.posing.range_moments import pose_heights, pose_lifted, pose_moments
 from optloc.solvers.posing.sight_lines import pose_directions, pose_minimax
 from optloc.solvers.posing.squared_ranges import pose_hull, pose_shor
-from optloc.solvers.posing.statement import ConicStatement, Locate
 from optloc.solvers.scaled_program import ScaledProblem
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.doppler import doppler_starts, has_doppler_of_rest

@@ -273,7 +273,12 @@ def test_a_number_that_may_mean_nothing_is_asked_for(mark, good, tmp_path):
     found = table_problem(tmp_path, text, missing=mark)
     assert found.read().problem.count == 11
     assert f"1 cell with {mark}: no reading" in found.notes
-    assert table_problem(tmp_path, text, missing="none").read().problem.count == 12
+    stated = table_problem(tmp_path, text, missing="none")
+    if mark.startswith("-"):  # a reading, as stated, but no distance
+        with pytest.raises(InvalidProblem, match=rf"range at A2 is {mark} m, and no distance is negative; .*{mark}"):
+            stated.read()
+    else:
+        assert stated.read().problem.count == 12
 
 
 def test_a_zero_of_the_first_arrival_is_a_reading(tmp_path):

@@ -134,16 +134,21 @@ def test_other_formulations_do_not_depend_on_the_unit(seed):
         assert lift.bound <= (((np.linalg.norm(P - S, axis=1) - z) / 0.03) ** 2).sum() + 1e-6
         assert sparse.bound <= sparse.value * (1.0 + 1e-6)
         assert nuclear.bound <= nuclear.value * (1.0 + 1e-6)
-        return np.concatenate([
-            [ball.margin / unit, ball.most / unit, lift.value, lift.bound, sparse.value, sparse.bound],
-            [nuclear.value / unit**2, nuclear.bound / unit**2, fix.level],
-            (fix.point - shift) / unit,
+        assert fix.least <= fix.level
+        exact = [
+            [ball.margin / unit, ball.most / unit, sparse.value, sparse.bound],
+            [nuclear.value / unit**2, nuclear.bound / unit**2],
             (extent(u, centre, theta, sides) - sides.sum(1) * shift) / unit,
-        ])  # fmt: skip
+        ]
+        # a baseline near a cost of zero, and a bisection that ends where the solver cannot decide
+        loose = [[lift.value, lift.bound, fix.level], (fix.point - shift) / unit]
+        return np.concatenate(exact), np.concatenate(loose)
 
-    base = all_of_them(1.0)
+    exact, loose = all_of_them(1.0)
     for unit in (1e-3, 1e3, 1e6):
-        np.testing.assert_allclose(all_of_them(unit), base, rtol=2e-4, atol=2e-4)
+        found = all_of_them(unit)
+        np.testing.assert_allclose(found[0], exact, rtol=2e-4, atol=2e-4)
+        np.testing.assert_allclose(found[1], loose, rtol=3e-2, atol=1e-2)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])

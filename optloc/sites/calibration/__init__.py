@@ -2,5 +2,16 @@
 
 from optloc.sites.calibration.calibrated import Alternative, Calibration, calibrate
 from optloc.sites.calibration.network import Network, NetworkSlot, network_of
+from optloc.sites.calibration.posed_network import PosedNetwork, RelaxedNetwork, pose_network
 
-__all__ = ["Alternative", "Calibration", "Network", "NetworkSlot", "calibrate", "network_of"]
+__all__ = [
+    "Alternative",
+    "Calibration",
+    "Network",
+    "NetworkSlot",
+    "PosedNetwork",
+    "RelaxedNetwork",
+    "calibrate",
+    "network_of",
+    "pose_network",
+]

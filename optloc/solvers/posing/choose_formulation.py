@@ -8,10 +8,10 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.problem import Problem
 from optloc.solvers.formulations import FORMULATIONS
+from optloc.solvers.posing.convex_statement import ConicStatement
 from optloc.solvers.posing.nonlinear import PosedProgram
 from optloc.solvers.posing.posed import Posed
 from optloc.solvers.posing.posed_conic import PosedConic
-from optloc.solvers.posing.statement import ConicStatement
 from optloc.solvers.solution import solve
 
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.solvers.posing.statement import Relation
+from optloc.solvers.posing.convex_statement import Relation
 
 # Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
 _SEED = 20261130
-# Statuses of Clarabel after which the factorisation may have lost its digits, and settings for a second attempt, as in
-# `formulations.conic`.
-_STOPPED = ("NumericalError", "InsufficientProgress")
+# If Clarabel stops early with a larger residual than this, its factorisation may have lost its digits. The settings are
+# for a second attempt, as in `formulations.conic`.
+_FINE = 1e-7
 _REGULAR = {"static_regularization_constant": 1e-7}
 
 
@@ -183,8 +183,11 @@ class ConvexProgram:
                 one.value = one.project(value)
         try:
             report = solve_problem(self.program, solver, own, warm=warm)
-            if report.status in _STOPPED and solver == "CLARABEL":
-                report = solve_problem(self.program, solver, {**_REGULAR, **own})
+            if solver == "CLARABEL" and report.outcome in ("failed", "inaccurate") and not report.worst <= _FINE:
+                again = solve_problem(self.program, solver, {**_REGULAR, **own})
+                # the values on the variables are those of the last solve
+                better = again.worst <= report.worst or not np.isfinite(report.worst)
+                report = again if better else solve_problem(self.program, solver, own)
         except ValueError as trouble:
             raise InvalidProblem(str(trouble), "solver", "see 'optloc list solvers'") from None
         if warm and not takes:

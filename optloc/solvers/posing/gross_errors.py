@@ -10,7 +10,7 @@ from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.problem.arrival_times import as_arrivals
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.position import spread_of
 from optloc.solvers.starts.sparse_rows import derivatives, deviations, lift_positions
 

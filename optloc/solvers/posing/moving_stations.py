@@ -13,7 +13,7 @@ from optloc.base.types import Array
 from optloc.linear.vectors import vectors
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.doppler import limited_rows
 from optloc.solvers.starts.registration import place_states, run_of, run_starts, steady_blocks
 from optloc.solvers.starts.registration_windows import has_windows, windows_of
@@ -119,8 +119,17 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
     if rows is None:
         raise InvalidProblem("no row measures a range rate", "formulation", 'use "nls"')
     surface, frame = rows.surface, problem.frame
-    names = ("place", "speed", "z", "whiten", "ranges", "rates", "design")
-    scene = DopplerScene.of(*(rows.given[name] for name in names), surface)
+    given = rows.given
+    scene = DopplerScene.of(
+        given["place"],
+        given["speed"],
+        given["z"],
+        given["whiten"],
+        given["ranges"],
+        given["rates"],
+        given["design"],
+        surface,
+    )
     far, size, answer = last_pass(scene, reach=_REACH)
     if not np.isfinite(answer.primal):
         raise InvalidProblem("the first pass of the relaxation has no solution", "formulation", 'use "nls"')

@@ -23,8 +23,8 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import METHODS, Method
 from optloc.solvers.posing.convex_constraints import conjunction_of
+from optloc.solvers.posing.convex_statement import Relation
 from optloc.solvers.posing.posed import Posed
-from optloc.solvers.posing.statement import Relation
 from optloc.solvers.scaled_program import ScaledProblem
 
 # Most iterations of IPOPT, as in the method "nlp".

@@ -17,7 +17,7 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import begin, in_parts, noting_place, pack
-from optloc.solvers.posing.statement import Relation
+from optloc.solvers.posing.convex_statement import Relation
 from optloc.solvers.solution import with_sources
 from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 

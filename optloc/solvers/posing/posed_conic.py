@@ -15,8 +15,8 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
+from optloc.solvers.posing.convex_statement import ConicStatement, Relation
 from optloc.solvers.posing.posed import Posed
-from optloc.solvers.posing.statement import ConicStatement, Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9

@@ -7,7 +7,7 @@ from dataclasses import replace
 from optloc.base.errors import InvalidProblem
 from optloc.linear.normal import with_station_noise
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate
 from optloc.solvers.scaled_program import ScaledProblem
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import is_registration_run

@@ -13,7 +13,7 @@ from optloc.models.primitives import WGS84_A
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import enclosed_ranges
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.position import height_sights, spread_of
 
 # Chi-square above that of the fix up to which positions are in the box of moments: a constraint may move the optimum

@@ -9,7 +9,7 @@ from optloc.base.types import Array
 from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.angles import Bearings, bearings, complete_bearings, cones_of, sights
 
 _NO_POSITION = (

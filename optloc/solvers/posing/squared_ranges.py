@@ -16,7 +16,7 @@ from optloc.linear.least_squares_ranges import ranges
 from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.problem.problem import Problem
-from optloc.solvers.posing.statement import ConicStatement, Locate, set_parameters, variable
+from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.squared_range import Pick, Squared, hull as pick_hull, last_weighting, shor as pick_shor
 
 _NO_RANGE = "the last unknown is the square of the distance, and no range is an unknown"

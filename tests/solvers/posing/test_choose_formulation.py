@@ -21,13 +21,18 @@ from optloc.solvers import FORMULATIONS
 # Problems of a full run. Registration takes a second for each program: a twentieth of the others.
 MANY = 500
 SLOW = {"registration_sdp": 25}
-# Problems of every run: moments, runs and Doppler shifts take half a second or more.
-FEW = {"registration_sdp": 1, "moment_sdp": 1, "doppler_sdp": 1}
+# Moments, runs and Doppler shifts take half a second or more.
+LONG = ("registration_sdp", "moment_sdp", "doppler_sdp")
 
 
-@pytest.mark.parametrize("formulation", SCENES)
+def marked(names):
+    """Return names as parameters of a test; those that take long are marked as slow."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in names]
+
+
+@pytest.mark.parametrize("formulation", marked(SCENES))
 def test_residuals_at_any_scale(formulation):
-    assert max(worst_residual(formulation, seed) for seed in range(FEW.get(formulation, 4))) <= 1e-6
+    assert max(worst_residual(formulation, seed) for seed in range(4)) <= 1e-6
 
 
 @pytest.mark.parametrize("formulation", ["squared_range_conic: hull", "sparse_errors", "nls"])
@@ -57,7 +62,7 @@ def test_residuals_and_duals_of_many_problems(formulation):
     assert wrong == []
 
 
-@pytest.mark.parametrize("formulation", LEAST)
+@pytest.mark.parametrize("formulation", marked(LEAST))
 def test_no_bound_is_above_a_multi_start(formulation):
     # one part in 1e6: the tolerance of the solvers
     assert above_multi_start(formulation, 0) <= 1e-6
@@ -69,7 +74,7 @@ def test_no_bound_of_many_is_above_a_multi_start(formulation):
     assert max(above_multi_start(formulation, seed) for seed in range(100)) <= 1e-6
 
 
-@pytest.mark.parametrize("formulation", METHODS)
+@pytest.mark.parametrize("formulation", marked(METHODS))
 def test_a_pose_without_changes_equals_the_method_of_its_name(formulation):
     assert apart_from_method(formulation, 1) <= 1e-6
 

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 
-from optloc.solvers.posing.statement import set_parameters, variable
+from optloc.solvers.posing.convex_statement import set_parameters, variable
 
 
 def test_parameters_get_values_and_variables_are_found_by_name():
