@@ -55,6 +55,34 @@ def costs() -> str:
     return "\n".join([*head, *lines])
 
 
+def posed() -> str:
+    """Return the formulations as a table: the library of their posed problem, or the twin of a closed form."""
+    from optloc.solvers import FORMULATIONS
+
+    libraries = {"ConicStatement": "cvxpy", "ScaledProblem": "CasADi"}
+    head = ["| formulation | rows | posed in | solution | time |", "|---|---|---|---|---|"]
+    lines = []
+    for name, line in FORMULATIONS.items():
+        twin = f"closed form: pose `{line.twin}`" if line.twin else "not posed"
+        library = twin if line.pose is None else libraries[line.pose.__annotations__["return"]]
+        page = f"theory/{name.split(':')[0]}.md"
+        lines.append(f"| [{name}]({page}) | {line.kinds} | {library} | {line.tight} | {line.cost} |")
+    return "\n".join([*head, *lines])
+
+
+def conic_solvers() -> str:
+    """Return the solvers of convex problems as a table: problems, method, and whether they use a start."""
+    from formulations.conic_solvers import SOLVERS
+
+    head = ["| solver | solves | method | uses a start |", "|---|---|---|---|"]
+    lines = [
+        f"| `{name}` | {one.solves()} | {one.summary.removesuffix(', takes a start')} | "
+        f"{'yes' if one.takes_start else 'no'} |"
+        for name, one in SOLVERS.items()
+    ]
+    return "\n".join([*head, *lines])
+
+
 def budgets() -> str:
     """Return the limits of a file as a table."""
     from dataclasses import asdict
@@ -378,6 +406,8 @@ GENERATED: dict[str, Callable[..., str]] = {
     "rows": rows,
     "formulation": formulation,
     "costs": costs,
+    "posed": posed,
+    "conic_solvers": conic_solvers,
     "formats": formats,
     "kinds": kinds,
     "constraints": constraints,

@@ -68,6 +68,20 @@ def test_every_block_runs_and_prints_what_is_shown(page, tmp_path, monkeypatch):
     assert [name for name in pictures if not (Path(name).exists() and (page.parent / name).exists())] == []
 
 
+def test_each_task_of_optimisation_has_at_most_three_steps():
+    page = (DOCS / "optimisation.md").read_text(encoding="utf-8")
+    tasks = page.split("## Five tasks")[1].split("\n## ")[0].split("\n### ")[1:]
+    assert len(tasks) == 5
+    for task in tasks:
+        first = ast.parse(re.search(r"```python\n(.*?)```", task, re.DOTALL)[1])
+        calls = [ast.unparse(call.func) for call in ast.walk(first) if isinstance(call, ast.Call)]
+        # the task on objectives has one problem for each of two objectives
+        count = calls.count("optloc.pose")
+        steps = [name for name in calls if name == "optloc.pose" or name.startswith("posed.")]
+        assert len([name for name in steps if name != "posed.solve"]) <= 2 * count, task
+        assert 1 <= calls.count("posed.solve") <= 2 * count, task
+
+
 def test_marks_are_known_and_few_blocks_are_not_run():
     found = [block for page in PAGES for block in blocks(page)]
     assert [block.mark for block in found if block.mark and not block.mark.startswith(MARKS)] == []
