@@ -171,7 +171,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "targets": len(set(loaded.targets)),
         "rows": {block.kind: block.count for block in problem.rows},
         "absent_rows": int((problem.weight == 0.0).sum()),
-        "constraints": [limit.name for limit in (*problem.constraints, *problem.fences)],
+        "constraints": [stated.name for stated in (*problem.constraints, *problem.fences)],
         "biases": {bias.name: _bias(loaded, bias) for bias in problem.biases},
         "unknowns": int(present_unknowns(batch).max()),
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},

@@ -132,6 +132,12 @@ def constraints_of(
     return tuple(_merge(found)), tuple(motions)
 
 
+def divided(limits: Sequence[Limit]) -> dict[str, Any]:
+    """Return the arguments `constraints` and `fences` of a `Problem`."""
+    fences = tuple(limit for limit in limits if isinstance(limit, Fence))
+    return {"constraints": tuple(limit for limit in limits if not isinstance(limit, Fence)), "fences": fences}
+
+
 def _made(kind: ConstraintKind, values: ConstraintValues) -> Any:
     """Return what a kind makes of its values; an error gets the place of the table."""
     try:

@@ -23,6 +23,7 @@ from optloc.files.constraint_reader import (
     Demand,
     constraints_of,
     demands_of,
+    divided,
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
@@ -323,8 +324,8 @@ def _problem(
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
-    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
+    limits, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
+    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, **divided(limits))
     check_budget("unknowns", made.layout.n_shared, source)
     return _check(made, source, medium_in(file, source, frame, stations))
 

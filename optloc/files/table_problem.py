@@ -104,7 +104,9 @@ class TableProblem:
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
         made = assemble(file, stations, tables, out.name, values=True, more=more)
         loaded = replace(made, loaded=replace(made.loaded, source=self.source.name)).plausible("table")
-        return replace(loaded, table=self.as_read)
+        # of S minus P, the report names the speeds of both waves
+        speed = loaded.speed if any(word == "wave" for word, _ in self.about) else ""
+        return replace(loaded, table=self.as_read, speed=speed)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file and its tables, and return their paths."""

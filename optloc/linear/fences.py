@@ -180,9 +180,10 @@ def slot_name(problem: Problem, fence: Fence) -> str:
 
 
 class FenceTerm(NamedTuple):
-    """A fence as a function of positions (..., d): its unknown's name, and its numbers in the library of the positions.
+    """A fence as a function of positions: the name of its unknown, and its numbers in the library of the positions.
 
-    For a position of each epoch, the fence applies at each epoch, and the arrays have an axis of epochs of length one.
+    If each epoch has a position, the fence applies at each epoch. The arrays then have an axis of length one for the
+    epochs.
     """
 
     name: str
@@ -340,8 +341,8 @@ def posterior_spread(problem: Problem, x: Array, covariance: Array) -> Array:
             across = (spread @ line[..., None])[..., 0]
             variance, place = (across * line).sum(-1), (mean * line).sum(-1)
             # the law without this fence, along its normal and in units of its sigma
-            open_ = np.maximum(1.0 - precision[:, j] * variance, _ALONE)
-            variance, place = variance / open_, (place - pull[:, j] * variance) / open_
+            share = np.maximum(1.0 - precision[:, j] * variance, _ALONE)
+            variance, place = variance / share, (place - pull[:, j] * variance) / share
             length = np.sqrt(1.0 + variance)
             margin = (u[:, j] - place) / length
             w, bend = derivatives_of_margin(margin)

@@ -1,7 +1,8 @@
 """Truncated normal distributions of fixes at or near bounds, and the shape of the cost inside the bounds.
 
 Inequality constraints give h bounds. Arrays have N fixes of d coordinates, and n shared unknowns. The slack is the
-distance of a fix from a bound. Near a fix, a bound is replaced by its tangent plane.
+distance of a fix from a bound. Near a fix, the bound of a height is replaced by its tangent plane. Circles, roads, the
+ground and other bent bounds, unions and polygons to keep out of are not: a function tells the admitted points.
 """
 
 from __future__ import annotations
@@ -10,9 +11,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.records import take
-from optloc.base.types import Array, Polygon
-from optloc.linear.constraints import Level, bounds, exact, is_exact, is_flat, levels, outwards
+from optloc.base.linalg import spread_directions
+from optloc.base.records import present, take
+from optloc.base.types import Array, Band, Constraint, Polygon
+from optloc.linear.constraints import (
+    TOLERANCE,
+    Level,
+    bounds,
+    exact,
+    is_admitted,
+    is_exact,
+    is_flat,
+    levels,
+    outwards,
+    violation,
+)
 from optloc.linear.mirror import one_position
 from optloc.model_checks.shape import AWAY, ShapeTest
 from optloc.problem.problem import Problem
@@ -29,6 +42,8 @@ _FLAT = 0.1
 _ON = 1e-3
 # A shorter inward direction is parallel to other bounds.
 _ALONG = 1e-6
+# Directions and radii, in standard deviations, of the points that are tested for a bound without a plane nearby.
+_WAYS, _RADII = {2: 24, 3: 60}, (0.5, 1.0, 1.5, 2.0, 2.5, _NEAR)
 
 
 def has_law(problem: Problem) -> bool:
@@ -70,24 +85,87 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     spread, sides = covariance[:, part, part], bounds(problem)
+    region = _regions(problem, x, spread, part)
     with np.errstate(all="ignore"):
         values, normal = _planes(problem, sides, x, part)
         sigma = np.sqrt(np.maximum(np.einsum("nhi,nij,nhj->nh", normal, spread, normal), 0.0))
         # a bound along which an equality fixes the position truncates nothing
+        # and a bound without a plane is left to the function of the region, except for the shape of the cost on it
         open_ones = (sigma > 0.0) & np.isfinite(values)
+        told = None if region is None else present(region)
+        plain = np.array([not _needs_region(problem.constraints[side.constraint]) for side in sides], dtype=bool)
+        open_ones &= plain if told is None else np.where(told[:, None], np.abs(values) <= _ON * sigma, plain)
         near = open_ones & (values <= _NEAR * sigma)
-        if not near.any():
+        if not near.any() and told is None:
             return None
         # if one bound is near, the farther bounds of the same fix count up to `_REACH`
         slack = np.where(near.any(1)[:, None] & open_ones & (values <= _REACH * sigma), np.maximum(values, 0.0), np.inf)
         departures = _departures(problem, sides, x, spread, values, normal, np.isfinite(slack))
+    if told is not None:
+        departures = np.where(told[:, None], 0.0, departures)
     bent = np.isfinite(slack) & (departures > _FLAT * sigma)
     # a curved bound that the fix does not touch is ignored; if the fix touches it, the result is not sound
     touched = slack <= _ON * sigma
     slack = np.where(bent & ~touched, np.inf, slack)
     along, span = _edges(problem, sides, x, part)
-    truncated = Truncated(normal, slack, along, span, departures, shift[:, part], spread)
+    truncated = Truncated(normal, slack, along, span, departures, shift[:, part], spread, region)
     return Law(truncated, ~(bent & touched).any(1))
+
+
+def _needs_region(constraint: Constraint) -> bool:
+    """Return whether only a function tells the points that an inequality admits: no plane replaces its bound."""
+    if isinstance(constraint, Polygon):
+        return constraint.outside
+    return not isinstance(constraint, Band) or constraint.kind not in _PLANAR
+
+
+# Quantities whose bounds are planes, or nearly planes at the distances of errors.
+_PLANAR = ("plane", "height", "visible")
+
+
+@dataclass(frozen=True, eq=False)
+class AdmittedPoints:
+    """The points that the inequalities of one problem admit, as a function of the distance from its fix.
+
+    - problem: one problem, with inequalities only.
+    - x (size,): the fix.
+    - part: slice of the position in x.
+    """
+
+    problem: Problem
+    x: Array
+    part: slice
+
+    def __call__(self, points: Array) -> Array:
+        """Return flags (...) of the admitted ones of points (..., d), metres from the fix."""
+        flat = points.reshape(-1, points.shape[-1])
+        moved = np.repeat(self.x[None], len(flat), axis=0)
+        moved[:, self.part] += flat
+        return is_admitted(self.problem, moved).reshape(points.shape[:-1])
+
+
+def _regions(problem: Problem, x: Array, spread: Array, part: slice) -> Array | None:
+    """Return functions (N,) that tell the admitted points of fixes near bounds without planes, and None for others.
+
+    The result is None if no fix has such a function. `x` (N, size) are the fixes, `spread` (N, d, d) the covariances of
+    their positions, and `part` is the slice of the position.
+    """
+    limits = tuple(c for c in problem.constraints if not is_exact(c))
+    if not any(_needs_region(c) for c in limits):
+        return None
+    d, out = part.stop - part.start, np.full(len(x), None, dtype=object)
+    usable = np.flatnonzero(np.isfinite(spread).all((1, 2)) & np.isfinite(x).all(1))
+    values, vectors = np.linalg.eigh(spread[usable])
+    factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    ways = (np.array(_RADII)[:, None, None] * spread_directions(_WAYS[d], d)).reshape(-1, d)
+    moved = np.repeat(x[usable][:, None], len(ways), axis=1)
+    moved[..., part] += ways @ np.swapaxes(factor, -1, -2)
+    limited = replace(problem, constraints=limits)
+    many = limited.take(np.repeat(usable, len(ways)))
+    broken = (violation(many, moved.reshape(-1, x.shape[-1])) > TOLERANCE).reshape(len(usable), len(ways))
+    for i in usable[broken.any(1)]:
+        out[i] = AdmittedPoints(limited.take(np.array([i])), x[i], part)
+    return out if broken.any() else None
 
 
 def _planes(problem: Problem, sides: tuple[Level, ...], x: Array, part: slice) -> tuple[Array, Array]:
@@ -166,10 +244,11 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
     """
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
-    d = slot.size
-    moved, increases = np.zeros((len(x), d, d)), np.ones((len(x), d))
-    for i in range(len(x)):
-        for k, (step, increase) in enumerate(_inward_steps(take(law, i))):
+    steps = [_inward_steps(take(law, i)) for i in range(len(x))]
+    width = max(1, *(len(one) for one in steps))
+    moved, increases = np.zeros((len(x), width, slot.size)), np.ones((len(x), width))
+    for i, one in enumerate(steps):
+        for k, (step, increase) in enumerate(one):
             moved[i, k], increases[i, k] = step, increase
     spread = covariance[:, part, part]
     pull = covariance[:, :, part] @ np.linalg.pinv(spread, hermitian=True)
@@ -180,16 +259,19 @@ def departure_inwards(problem: Problem, x: Array, covariance: Array, law: Trunca
 def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
     """Return inward steps (d,) from each bound that a fix touches, m, and the increase of the quadratic model there.
 
-    `law` is the distribution of one position. A step stays on the other bounds that the fix touches.
+    `law` is the distribution of one position. A step stays on the other bounds that the fix touches. With a function
+    for the admitted points, the steps are in all directions.
     """
     # `factor` converts independent standard normal numbers to metres. In these numbers, the distribution without bounds
     # is round with unit variance and the mean `middle`, and the fix is at zero.
     factor = factor_of(law.covariance)
+    middle = np.linalg.solve(factor.T @ factor, factor.T @ law.shift)
+    if law.region is not None:
+        return _steps_within(law, factor, middle)
     turned = law.normal @ factor
     sigma = np.sqrt((turned**2).sum(-1))
     touched = np.flatnonzero((law.slack <= _ON * sigma) & (sigma > 0.0) & _touches_edge(law))[: factor.shape[0]]
     unit = turned[touched] / sigma[touched, None]
-    middle = np.linalg.solve(factor.T @ factor, factor.T @ law.shift)
     others = np.where(np.isin(np.arange(len(sigma)), touched), np.inf, law.slack)
     rest = replace(law, slack=others)
     found = []
@@ -206,6 +288,26 @@ def _inward_steps(law: Truncated) -> list[tuple[Array, float]]:
             length = min(mean_along + np.sqrt(mean_along**2 + AWAY**2), end)
             found.append((length * (factor @ inward), max(length**2 - 2.0 * mean_along * length, 1e-300)))
     return found
+
+
+# Directions of steps, by the number of dimensions with a width; shorter steps, in standard deviations, say nothing.
+_STEPS, _SHORT = {1: 2, 2: 8, 3: 20}, 0.3
+
+
+def _steps_within(law: Truncated, factor: Array, middle: Array) -> list[tuple[Array, float]]:
+    """Return steps (d,) from a fix to admitted points, m, and the increases of the quadratic model there.
+
+    `factor` and `middle` are those of `_inward_steps`.
+    """
+    rank = factor.shape[1]
+    if rank == 0:
+        return []
+    ways = np.array([[-1.0], [1.0]]) if rank == 1 else spread_directions(_STEPS[rank], rank)
+    mean_along = ways @ middle
+    lengths = np.minimum(mean_along + np.sqrt(mean_along**2 + AWAY**2), law.exits(ways @ factor.T))
+    increases = lengths**2 - 2.0 * mean_along * lengths
+    kept = np.flatnonzero((lengths > _SHORT) & (increases > _SHORT**2))
+    return [(lengths[k] * (factor @ ways[k]), float(increases[k])) for k in kept]
 
 
 def _touches_edge(law: Truncated) -> Array:

@@ -3,7 +3,8 @@
 Without bounds the distribution is ``N(x + shift, covariance)``. It is truncated to the admitted points. The fix x is
 the admitted point of highest density. The distribution is integrated along rays from the fix, each up to the first
 bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target on
-the bound.
+the bound. Where the admitted points are no intersection of half-spaces, a function tells them from the others. A ray
+can then have several admitted parts, each of which counts as a ray of its own.
 
 Letters: h bounds, d coordinates, k rays, n nodes on a ray. The squared deviation of a point is its squared distance
 from x + shift, in standard deviations. The excess of a point is its squared deviation minus the squared deviation of
@@ -15,12 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.linalg import factor_semidefinite, spread_directions
-from optloc.base.records import Axes, take
+from optloc.base.records import Axes, present, take
 from optloc.base.types import Array
 
 HELD = 1e-13
@@ -28,6 +29,8 @@ HELD = 1e-13
 
 # Number of rays by dimension: the error of a probability is below 0.2 %, the error of a moment below 1 %.
 _RAYS = {2: 360, 3: 2500}
+# The same for rays on which the admitted parts are searched, which takes longer: errors are twice as large.
+_SEARCHED = {2: 240, 3: 800}
 # Number of nodes on a ray, and increase of the squared deviation at its end: 45 neglects a probability of 1e-10.
 _NODES, _END = 16, 45.0
 # Number of nodes on a ray for sorted values, and the share by which they shift from ray to ray (golden section).
@@ -45,6 +48,10 @@ _BENT, _ROUNDED = 0.02, 1e-3
 _EXACT = 1e-12
 # Relative difference of widths below which intervals count as equally short: the accuracy of the nodes.
 _ALIKE = 0.01
+# Points on a ray at which admitted parts are looked for, and halvings of the interval that contains an end of a part.
+_TRIED, _HALVINGS = 48, 20
+# Length of a step, in steps, up to which the first bound is looked for: the density ends before.
+_FAR = 10.0
 # Relative extension of polygon edges, so that a ray through a corner meets one of the two edges.
 _LONGER = 1e-9
 # Standard deviations by which a point may exceed a plane bound and still count as admitted: rounding of coordinates.
@@ -71,6 +78,9 @@ class Truncated:
         Mean of the distribution without bounds minus the fix, metres.
     covariance : array (..., d, d)
         Covariance of the distribution without bounds, square metres.
+    region : object array (...), optional
+        For distributions whose bounds are no planes: functions that map points (..., d), metres from the fix, to flags
+        (...) of the admitted ones. None for the others. With such a function, planes serve the shape of the cost only.
     """
 
     normal: Annotated[Array, Axes(2, slots=True, empty=0.0)]
@@ -80,11 +90,20 @@ class Truncated:
     give: Annotated[Array, Axes(1, slots=True, empty=0.0)]
     shift: Annotated[Array, Axes(1, empty=0.0)]
     covariance: Annotated[Array, Axes(2)]
+    region: Annotated[Array, Axes(0, empty=None)] | None = None
 
     @property
     def cuts(self) -> Array:
         """Return a mask (...) of the distributions that a bound truncates."""
-        return np.asarray(np.isfinite(self.slack).any(-1) & np.isfinite(self.covariance).all((-1, -2)))
+        bounded = np.isfinite(self.slack).any(-1) | self._has_region
+        return np.asarray(bounded & np.isfinite(self.covariance).all((-1, -2)))
+
+    @property
+    def _has_region(self) -> Array:
+        """Return a mask (...) of the distributions with a function for the admitted points."""
+        if self.region is None:
+            return np.zeros(self.slack.shape[:-1], dtype=bool)
+        return present(np.atleast_1d(self.region)).reshape(self.slack.shape[:-1])
 
     def moments(self) -> tuple[Array, Array]:
         """Return mean minus fix (..., d), metres, and covariance (..., d, d), m^2, of truncated distributions.
@@ -98,7 +117,8 @@ class Truncated:
         mean, covariance = _moments_behind_one_bound(self)
         finite = np.isfinite(self.slack)
         # Distributions with several bounds, or with a bound that has ends: the edge of a polygon.
-        several = (finite.sum(-1) != 1) | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
+        several = self._has_region | (finite.sum(-1) != 1)
+        several = several | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
             index = tuple(map(int, i)) if several.ndim else ()
             mean[index], covariance[index] = take(self, index).moments_by_rays()
@@ -134,6 +154,8 @@ class Truncated:
 
     def admits(self, points: Array) -> Array:
         """Return a mask (...) of the points (..., d), metres from the fix of one distribution, inside the bounds."""
+        if self.region is not None:
+            return np.asarray(self._inside(points))
         sigma = np.sqrt(np.maximum(np.einsum("hi,ij,hj->h", self.normal, self.covariance, self.normal), 0.0))
         beyond = points @ self.normal.T - np.where(np.isfinite(self.slack), self.slack, 0.0)
         outside = np.isfinite(self.slack) & (beyond > self.give + _ON * sigma)
@@ -221,7 +243,9 @@ class Truncated:
         excess = float(np.interp(level, *rays.levels()[::-1])) ** 2
         # At the length s of a ray the excess is s^2 - 2 lean s. Solve for s; a ray that ends earlier keeps its end.
         share = np.minimum(1.0, (rays.lean + np.sqrt(rays.lean**2 + excess)) / np.maximum(rays.length, 1e-300))
-        points = (rays.tip * share[:, None]) @ plane.T
+        # parts of the region that the fix does not see have no place in one closed line
+        seen = rays.begin <= 0.0
+        points = (rays.tip * share[:, None])[seen] @ plane.T
         # In two dimensions the rays are sorted by angle.
         boundary = points if plane.shape[1] == 2 else points[ConvexHull(points).vertices]
         return np.concatenate([boundary, boundary[:1]])
@@ -234,21 +258,64 @@ class Truncated:
         factor = factor_of(self.covariance)
         rank = factor.shape[1]
         whitener = np.linalg.solve(factor.T @ factor, factor.T)
-        unit, middle = _directions(rank, count or _RAYS.get(rank, 2)), whitener @ self.shift
+        # Rays whose admitted parts are searched cost more, so there are fewer.
+        usual = _RAYS if self.region is None else _SEARCHED
+        unit, middle = _directions(rank, count or usual.get(rank, 2)), whitener @ self.shift
         step, lean = unit @ factor.T, unit @ middle
         # A ray ends where the squared deviation has increased by `_END`.
-        length = np.minimum(self.exits(step), lean + np.sqrt(lean**2 + _END))
+        length = lean + np.sqrt(lean**2 + _END)
+        if self.region is None:
+            length = np.minimum(self.exits(step), length)
+            begin = np.zeros_like(length)
+        else:
+            number, begin, length = self._parts(step, length)
+            step, lean = step[number], lean[number]
         node, share = _gauss()
-        weight = share * length[:, None] * _density(length[:, None] * node, lean[:, None], rank)
-        tip = length[:, None] * step
-        place = tip[:, None] * node[:, None]
-        return _Rays(lean, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
+        at = begin[:, None] + (length - begin)[:, None] * node
+        weight = share * (length - begin)[:, None] * _density(at, lean[:, None], rank)
+        place, tip = at[..., None] * step[:, None], length[:, None] * step
+        return _Rays(lean, begin, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
+
+    def _inside(self, points: Array) -> Array:
+        """Return flags (...) of admitted points (..., d), metres from the fix, by the function of one distribution."""
+        # One distribution taken out of a batch has its function in an array without axes.
+        function: Any = self.region[()] if isinstance(self.region, np.ndarray) else self.region
+        return np.asarray(function(points))
+
+    def _parts(self, step: Array, length: Array) -> tuple[Array, Array, Array]:
+        """Return the admitted parts of rays: the number of the ray of each, and its begin and end in steps.
+
+        `step` (k, d) are the steps of the rays, metres, and `length` (k,) the numbers of steps at which they end.
+        """
+        shares = np.linspace(0.0, 1.0, _TRIED + 1)
+        inside = self._inside((length[:, None] * shares)[..., None] * step[:, None])
+        inside[:, 0] = True  # the fix, whatever rounding says
+        ray, cell = np.nonzero(inside[:, 1:] != inside[:, :-1])
+        low, high, enters = shares[cell], shares[cell + 1], inside[ray, cell + 1]
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            same = self._inside((length[ray] * middle)[:, None] * step[ray]) == enters
+            low, high = np.where(same, low, middle), np.where(same, middle, high)
+        # every ray begins inside, so that begins and ends alternate on it
+        every = np.arange(len(step))
+        begins = np.concatenate([every, ray[enters]]), np.concatenate([np.zeros(len(step)), high[enters]])
+        last = np.flatnonzero(inside[:, -1])
+        ends = np.concatenate([ray[~enters], last]), np.concatenate([low[~enters], np.ones(len(last))])
+        first, final = (np.lexsort((at, number)) for number, at in (begins, ends))
+        number = begins[0][first]
+        return number, begins[1][first] * length[number], ends[1][final] * length[number]
 
     def exits(self, step: Array) -> Array:
         """Return the number (k,) of steps (k, d), metres, from the fix to the first bound; infinite without a bound.
 
         The number is not an integer: 2.5 means that the bound is 2.5 times the step away.
         """
+        if self.region is not None:
+            number, _, end = self._parts(step, np.full(len(step), _FAR))
+            # a direction inwards may leave the region at its very begin, by rounding: the longest part then counts
+            out = np.zeros(len(step))
+            np.maximum.at(out, number, end)
+            return np.where(out < _FAR, out, np.inf)
         rate, size = step @ self.normal.T, np.sqrt((step**2).sum(-1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
             length = np.where(rate > _EXACT * size, np.maximum(self.slack, 0.0) / rate, np.inf)
@@ -265,8 +332,10 @@ class _Rays(NamedTuple):
     ----------
     lean : array (k,)
         Mean of the distribution without bounds along each ray, in standard deviations.
+    begin : array (k,)
+        Distance from the fix at which each ray begins, in standard deviations; zero except for separate parts.
     length : array (k,)
-        Length of each ray, in standard deviations.
+        Distance from the fix at which each ray ends, in standard deviations.
     rank : int
         Number of dimensions in which the distribution has a width.
     middle : array (rank,)
@@ -284,6 +353,7 @@ class _Rays(NamedTuple):
     """
 
     lean: Array
+    begin: Array
     length: Array
     rank: int
     middle: Array
@@ -303,8 +373,10 @@ class _Rays(NamedTuple):
         """
         k = np.arange(len(self.length))[:, None]
         node = (np.arange(nodes) + k * _GOLDEN % 1.0) / nodes
-        weight = self.length[:, None] * _density(self.length[:, None] * node, self.lean[:, None], self.rank)
-        return self.tip[:, None] * node[..., None], weight
+        size = (self.length - self.begin)[:, None]
+        at = self.begin[:, None] + size * node
+        share = at / np.maximum(self.length[:, None], 1e-300)
+        return self.tip[:, None] * share[..., None], size * _density(at, self.lean[:, None], self.rank)
 
     def levels(self) -> tuple[Array, Array]:
         """Return thresholds (t,) and the probabilities (t,) of the regions that they enclose, both increasing.
@@ -317,9 +389,10 @@ class _Rays(NamedTuple):
 
     def _mass(self, excess: float) -> float:
         """Return the unnormalised probability of points whose excess is at most `excess`."""
-        end = np.minimum(self.length, self.lean + np.sqrt(self.lean**2 + excess))[:, None]
-        node, share = _gauss()
-        return float((share * end * _density(end * node, self.lean[:, None], self.rank)).sum())
+        end = np.minimum(self.length, self.lean + np.sqrt(self.lean**2 + excess))
+        size, (node, share) = np.maximum(end - self.begin, 0.0)[:, None], _gauss()
+        at = self.begin[:, None] + size * node
+        return float((share * size * _density(at, self.lean[:, None], self.rank)).sum())
 
 
 def is_along(projector: Array, points: Array) -> Array:
@@ -379,7 +452,7 @@ def _gauss() -> tuple[Array, Array]:
     return 0.5 * (node + 1.0), 0.5 * weight
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _directions(rank: int, count: int) -> Array:
     """Return evenly distributed unit vectors (k, rank), the directions of the rays: `count`, or two on a line."""
     return np.array([[-1.0], [1.0]])[:, :rank] if rank <= 1 else spread_directions(count, rank)

@@ -22,7 +22,7 @@ from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED
 from optloc.show.pictures.fixes import lines_of_position
 from optloc.show.pictures.outlines import level_planes
-from optloc.show.pictures.style import figure_class, is_local, regions_of, states_of, thinned
+from optloc.show.pictures.style import figure_class, is_local, regions_of, scene_of, states_of, thinned
 from optloc.uncertainty.outline import Outline
 
 # Coastlines for maps without a network.
@@ -462,6 +462,35 @@ def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, 
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
     found = lines_of_position(problem, fix, lon, lat, place[:, : problem.dimension])
     return [(one.name if one.kind == "isodoppler" else f"{one.kind} {one.name}", one.line) for one in found]
+
+
+# Points along a limit without ends, and half its length in extents of the plan.
+_ALONG, _BEYOND = 61, 3.0
+
+
+def constraint_lines(problem: Problem, fixes: Sequence[Fix]) -> list[tuple[str, Array]]:
+    """Return the shapes of constraints in the plan of an ENU frame: label, and line (n, 2) of longitude and latitude.
+
+    The lines are at the height of the fixes. Other frames have no plan, so the list is empty.
+    """
+    if problem.frame.kind != "enu" or not (problem.constraints or problem.fences):
+        return []
+    scene = scene_of(problem, fixes)
+    known = scene.fixes[np.isfinite(scene.fixes).all(-1)]
+    places = np.concatenate([scene.stations, known])
+    level = float(np.median(known[:, 2])) if len(known) and places.shape[-1] > 2 else 0.0
+    extent = float(np.ptp(places[:, :2], axis=0).max()) or 1.0
+    found = []
+    for region in (each for each in scene.regions if each.view == (0, 1)):
+        for line in region.lines:
+            ends = np.asarray(line)
+            if len(ends) == 2:  # a limit without ends: only its part around the plan, since the plan is flat
+                along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+                steps = _BEYOND * extent * np.linspace(-1.0, 1.0, _ALONG)
+                ends = ends.mean(0) + steps[:, None] * along
+            lat, lon, _ = problem.frame.to_geodetic(np.column_stack([ends, np.full(len(ends), level)]))
+            found.append((region.label, np.degrees(np.stack([np.unwrap(lon), lat], axis=-1))))
+    return found
 
 
 def _grid_beyond(low: float, high: float) -> Array:

@@ -31,6 +31,7 @@ from optloc.show.map import (
     Label,
     Plane,
     Spots,
+    constraint_lines,
     dot,
     fixed_spots,
     ground_tracks,
@@ -192,7 +193,8 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     alone = sum(int(np.sum(fix.unchecked)) for fix in several)
     count = sum(fix.code.size for fix in several)
     which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
-    return _marks_page(problem, found, others, title, "fix", single, f"{which}{UNCHECKED}." if alone else "")
+    first, shapes = f"{which}{UNCHECKED}." if alone else "", constraint_lines(problem, several)
+    return _marks_page(problem, found, others, title, "fix", single, first, shapes)
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
@@ -255,13 +257,20 @@ def _on_earth(geodetic: bool) -> None:
 
 
 def _marks_page(
-    problem: Problem, marks: Spots, others: Spots, title: str, role: str, single: Fix | None, first: str = ""
+    problem: Problem,
+    marks: Spots,
+    others: Spots,
+    title: str,
+    role: str,
+    single: Fix | None,
+    first: str = "",
+    shapes: Sequence[tuple[str, Array]] = (),
 ) -> str:
     """Return the HTML of a page with the map of fixes or tracks.
 
     `marks` are the marks of fixes or scans, and `others` the marks of alternatives. `role` names a mark, "fix" or
     "track". `single` is the fix if there is only one fix, for lines of position. `first` is a paragraph above the map;
-    it may be empty.
+    it may be empty. `shapes` are names and lines (n, 2), degrees, of constraints.
     """
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _map_limits([stations.place, marks.place, others.place, *(line for _, line in tracks)])
@@ -271,6 +280,7 @@ def _marks_page(
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
         **({"ground tracks": _curves(_nearest_turn(tracks, middle), plane, "line")} if tracks else {}),
+        **({"constraints": _curves(_nearest_turn(shapes, middle), plane, "line limit")} if shapes else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
         role: [*_ellipses(marks, plane, middle), *_dots(marks, plane, middle, _MARK if few else _SMALL)],
@@ -283,6 +293,7 @@ def _marks_page(
     text = f"White: stations. Blue: {role}, with 95 % region; orange if not ok. Point at a mark for details."
     if marks.local is not None and marks.local.any():
         text = text.replace("95 % region;", "95 % region (dotted: a local ellipse, not valid);")
+    text += " Brown: limits of the target." if shapes else ""
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])

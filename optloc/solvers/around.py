@@ -46,7 +46,7 @@ def starts_on_equalities(problem: Problem, x: Array) -> Array:
     face = exact(problem)
     if not any(_surface(problem, level) is not None for level in face):
         return np.zeros((len(x), 0, x.shape[-1]))
-    good: Array = np.isfinite(x).min(-1)
+    good = ~np.isnan(x.sum(-1))
     first = np.where(good.any(1)[:, None], x[np.arange(len(x)), good.argmax(1)], np.nan)
     return starts_around(problem, face, np.arange(len(x)), first)
 

@@ -9,7 +9,7 @@ parameter vector. Costs are chi-square values.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,19 @@ from optloc.base.types import Array, Status
 from optloc.engine.admission import GRAZE, GROUND, SATELLITE
 from optloc.kernels.least_squares import refine
 from optloc.kernels.sums import equations_at
-from optloc.linear.constraints import TOLERANCE, Face, exact, faces, is_held, levels, outwards, violation
+from optloc.linear.constraints import (
+    TOLERANCE,
+    Face,
+    Level,
+    band_at,
+    bound_of,
+    exact,
+    faces,
+    is_held,
+    levels,
+    outwards,
+    violation,
+)
 from optloc.linear.normal import marginal
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
@@ -268,7 +280,7 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     starts, strata = _cheapest(pool, unanswered), strata_of(problem)
     starts = starts if strata is None else in_every_layer(strata, starts)
     # face 0 has no inequality, and its minima are in the pool already
-    on_faces = [_on_face(problem, sides, number, unanswered, starts, descend) for number in range(1, len(sides))]
+    on_faces = _on_faces(problem, sides, unanswered, starts, descend)
     size, width = len(pool.x), sum(found[1].shape[1] for found in on_faces)
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
     cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
@@ -346,28 +358,97 @@ def _cheapest(pool: Pool, items: Array) -> Array:
     return np.where(good[..., None], x, np.nan)
 
 
-def _on_face(
-    problem: Problem, sides: list[Face], number: int, items: Array, starts: Array, descend: Descend
-) -> tuple[Array, ...]:
-    """Return x, cost, code and face (n, q) of the minima on one face, and the costs (n, q) of infeasible minima.
+# Most starts that are refined together: their normal equations need some tens of megabytes.
+_TOGETHER = 2**14
 
-    `number` is the index of the face in `sides`, the list of all faces. `items` (n,) are the numbers of the problems,
-    and `starts` (n, q, size) their starts; curved faces get more. Costs are infinite in all other slots.
+
+def _on_faces(
+    problem: Problem, sides: list[Face], items: Array, starts: Array, descend: Descend
+) -> list[tuple[Array, ...]]:
+    """Return, for each face but the first, what `_on_alike` returns for it.
+
+    `sides` is the list of all faces. `items` (n,) are the numbers of the problems, and `starts` (n, q, size) their
+    starts. Faces with the same quantities are one batch: a road has many of them.
     """
-    starts = np.concatenate([starts, starts_around(problem, sides[number], items, starts[:, 0])], axis=1)
-    shape = starts.shape[:2]
-    cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
-    x = np.array(starts)
-    row, slot = np.nonzero(np.isfinite(starts).all(-1))
-    x[row, slot], found, status = descend(problem, starts[row, slot], items[row], sides[number])
-    part = problem.take(items[row])
+    found: dict[int, tuple[Array, ...]] = {}
+    groups: dict[tuple[Hashable, ...], list[int]] = {}
+    for number in range(1, len(sides)):
+        groups.setdefault(_structure(problem, sides[number]), []).append(number)
+    most = max(1, _TOGETHER // max(1, 4 * starts.shape[0] * starts.shape[1]))
+    for numbers in groups.values():
+        for first in range(0, len(numbers), most):
+            chosen = numbers[first : first + most]
+            found |= dict(zip(chosen, _on_alike(problem, sides, chosen, items, starts, descend), strict=True))
+    return [found[number] for number in range(1, len(sides))]
+
+
+def _structure(problem: Problem, face: Face) -> tuple[Hashable, ...]:
+    """Return a key of everything but the numbers of the levels of a face."""
+    bands = [(band_at(problem, level), level.epoch) for level in face]
+    return tuple((b.kind, b.target, b.other, b.table, b.coefficients.shape[-1], epoch) for b, epoch in bands)
+
+
+def _on_alike(
+    problem: Problem, sides: list[Face], numbers: list[int], items: Array, starts: Array, descend: Descend
+) -> list[tuple[Array, ...]]:
+    """Return x, cost, code and face (n, q) of the minima on faces, and the costs (n, q) of infeasible minima.
+
+    `numbers` are the indices in `sides` of faces with the same quantities; the result has one entry for each. `items`
+    and `starts` are as for `_on_faces`; curved faces get more starts. Costs are infinite in all other slots.
+    """
+    wider = [
+        np.concatenate([starts, starts_around(problem, sides[number], items, starts[:, 0])], axis=1)
+        for number in numbers
+    ]
+    places = [np.nonzero(np.isfinite(one).all(-1)) for one in wider]
+    own = np.concatenate([items[row] for row, _ in places])
+    start = np.concatenate([one[place] for one, place in zip(wider, places, strict=True)])
+    part, counts = problem.take(own), [len(row) for row, _ in places]
+    bands, size = [], problem.batch_shape[0]
+    for k in range(len(sides[numbers[0]])):
+        same = [(band_at(problem, sides[n][k]), bound_of(problem, sides[n][k])) for n in numbers]
+        splits = np.split(own, np.cumsum(counts)[:-1])
+        value = np.concatenate([np.broadcast_to(b, (size,))[one] for (_, b), one in zip(same, splits, strict=True)])
+        c = np.concatenate(
+            [
+                np.broadcast_to(band.coefficients, (size, band.coefficients.shape[-1]))[one]
+                for (band, _), one in zip(same, splits, strict=True)
+            ]
+        )
+        bands.append(replace(same[0][0], lower=value, upper=value, coefficients=c))
+    face = tuple(Level(k, "equal", level.epoch) for k, level in enumerate(sides[numbers[0]]))
+    ends, cost, status = descend(replace(part, constraints=tuple(bands)), start, np.arange(len(own)), face)
     # a minimum on a face may break another constraint; the face of both constraints is tried too
-    inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~is_hidden(part, x[row, slot]) & np.isfinite(found)
-    cost[row, slot] = np.where(inside, found, np.inf)
-    code[row, slot] = np.where(inside, status, np.int8(Status.INFEASIBLE))
-    refused = np.full(shape, np.inf)
-    refused[row, slot] = np.where(inside | (status != Status.OK), np.inf, found)
-    return x, cost, code, np.full(shape, number), refused
+    inside = (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
+    code = np.where(inside, status, np.int8(Status.INFEASIBLE))
+    refused = np.where(inside | (status != Status.OK), np.inf, cost)
+    out, first = [], 0
+    for number, one, place in zip(numbers, wider, places, strict=True):
+        end = first + len(place[0])
+        out.append(
+            _filled(
+                number,
+                one,
+                place,
+                ends[first:end],
+                np.where(inside, cost, np.inf)[first:end],
+                code[first:end],
+                refused[first:end],
+            )
+        )
+        first = end
+    return out
+
+
+def _filled(
+    number: int, starts: Array, place: tuple[Array, ...], x: Array, cost: Array, code: Array, refused: Array
+) -> tuple[Array, ...]:
+    """Return the results of one face in the slots `place` of its `starts` (n, q, size); see `_on_alike`."""
+    shape = starts.shape[:2]
+    costs, codes = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
+    ends, left = np.array(starts), np.full(shape, np.inf)
+    ends[place], costs[place], codes[place], left[place] = x, cost, code, refused
+    return ends, costs, codes, np.full(shape, number), left
 
 
 def is_minimum(problem: Problem, face: Face, x: Array) -> Array:

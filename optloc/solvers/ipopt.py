@@ -19,7 +19,7 @@ from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.kernels.sums import equations_at
-from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
+from optloc.linear.constraints import Face, conjunction, face_of, faces, is_conjunctive, on_face, restore, tangent_at
 from optloc.linear.fences import fence_numbers, symbolic_cost
 from optloc.linear.normal import decrement, prior_parts, step, with_station_noise
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
@@ -28,7 +28,7 @@ from optloc.linear.walks import chain_at, state_columns, walks
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import without_broken
+from optloc.solvers.inequalities import bound_pool, by_least_squares, without_broken
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.block_averages import average_blocks
@@ -81,9 +81,38 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
         code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
     cost[code == Status.NUMERICAL] = np.inf  # for instance a start on a station
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    found = without_broken(problem, Pool(x, cost, code, face, weights, pool.dof, pool.stages, missing=pool.missing))
+    found = Pool(x, cost, code, face, weights, pool.dof, pool.stages, missing=pool.missing)
+    # a program cannot contain a union; so each of its faces is an equality of one more program
+    united = any(not is_conjunctive(constraint) for constraint in problem.constraints)
+    found = bound_pool(problem, found, _on_face) if united else without_broken(problem, found)
     settled = settle(problem, found, Stage("nlp", f"{len(item)} programs", perf_counter() - began))
     return replace(settled, refined=False)  # not refined, so that a following "lsr" runs
+
+
+# Most starts of programs on one face of the constraints: those of least cost after projection onto it.
+_STARTS = 6
+
+
+def _on_face(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
+    """Return x (M, size), cost (M,) and status (M,) of the minima on a face that IPOPT reaches from starts (M, size).
+
+    `item` (M,) is the problem of each start. Faces at epochs along a course are left to least squares.
+    """
+    if any(level.epoch is not None for level in face):
+        return by_least_squares(problem, start, item, face)
+    part = problem.take(item)
+    with np.errstate(all="ignore"):
+        x = restore(part, face, start)
+        cost = equations_at(part, np.where(np.isfinite(x), x, start)).cost
+    ends, least, code = start.copy(), np.full(len(start), np.inf), np.full(len(start), int(Status.NUMERICAL))
+    for i in np.unique(item):
+        solver = _ScaledProblem(on_face(problem.take(np.array([i])), face))
+        own = np.flatnonzero(item == i)
+        for k in own[np.argsort(cost[own], kind="stable")][:_STARTS]:
+            ends[k], least[k], code[k] = solver.from_start(x[k] if np.isfinite(x[k]).all() else start[k])
+    number = faces(problem).index(face)
+    code = _stationary(part, ends, code, np.full(len(ends), number))
+    return ends, np.where(code == Status.NUMERICAL, np.inf, least), code
 
 
 def _of_blocks(problem: Problem, x: Array) -> Array:

@@ -8,10 +8,11 @@ from show.browser import Browser, executable
 from typer.testing import CliRunner
 
 import optloc
+from optloc import Frame, assemble, constraints, measured, solve, station_array
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.show import fix_page
-from optloc.show.map import fixed_spots, ground_tracks, lines_on_map
+from optloc.show.map import constraint_lines, fixed_spots, ground_tracks, lines_on_map
 
 RUN = CliRunner()
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
@@ -150,3 +151,21 @@ def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map(monkeypatch):
     page = fix_page(problem, fix, "far from an ellipse")
     assert "dotted: a local ellipse, not valid" in page
     assert 'class="ring local"' in page
+
+
+def test_constraints_are_lines_on_earth():
+    frame = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
+    places = np.array([[0.0, 0.0, 0.0], [9e3, 0.0, 50.0], [0.0, 9e3, 90.0], [9e3, 9e3, 0.0]])
+    rows = measured("range", np.linalg.norm(places - [4e3, 5e3, 700.0], axis=1), a=np.arange(4), sigma=5.0)
+    limits = [constraints.disc((4e3, 4e3), 2e3), constraints.half_plane((1.0, 0.0, 0.0), 7e3)]
+    problem = assemble(station_array(places), rows, frame=frame, constraints=limits)
+    fix = solve(assemble(station_array(places), rows, frame=frame), "gtrs+lsr")
+    (disc, line) = constraint_lines(problem, [fix])
+    assert [name for name, _ in (disc, line)] == ["region", "limit, ticks on the excluded side"]
+    lon, lat = np.radians(disc[1]).T
+    ring = frame.from_geodetic(lat, lon, np.full(len(lat), float(frame.to_geodetic(fix.position)[2])))
+    np.testing.assert_allclose(np.hypot(*(ring[:, :2] - [4e3, 4e3]).T), 2e3, atol=2.0)
+    assert np.ptp(line[1][:, 1]) < 1.0
+    page = fix_page(problem, fix, "Limits")
+    assert "limit, ticks on the excluded side" in page
+    assert constraint_lines(assemble(station_array(places), rows, constraints=limits), [fix]) == []

@@ -134,9 +134,9 @@ def histories(trials: Trials) -> Histories:
     import pandas as pd
 
     problem = trials.drawn.problem
-    if problem.constraints:
-        what = "a cost does not show whether constraints are met"
-        raise InvalidProblem(what, trials.title, "remove the constraints")
+    if problem.constraints or problem.fences:
+        what = "a cost does not show whether constraints are met, and the histories leave out fences"
+        raise InvalidProblem(what, trials.title, "remove the constraints and fences")
     if depends_on_place(problem):
         what = "the noise weights depend on the position, so costs of a history cannot be compared"
         raise InvalidProblem(what, trials.title, "remove the errors of the stations")

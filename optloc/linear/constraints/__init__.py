@@ -69,6 +69,7 @@ from optloc.linear.constraints.statements import (
 )
 from optloc.linear.constraints.violation import (
     TOLERANCE as TOLERANCE,
+    is_admitted as is_admitted,
     violation as violation,
     violation_names as violation_names,
     violation_of as violation_of,

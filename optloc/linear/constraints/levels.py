@@ -144,7 +144,8 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
     values = np.zeros((len(x), len(face)))
     gradients = np.zeros((len(x), len(face), problem.layout.n_shared))
     for i, level in enumerate(face):
-        jet, columns = quantity_at(problem, band_at(problem, level), x, level.epoch)
+        with np.errstate(all="ignore"):  # the distance from a point has no derivative there
+            jet, columns = quantity_at(problem, band_at(problem, level), x, level.epoch)
         values[:, i] = jet.value - bound_of(problem, level)
         for seed, partial in jet.partials.items():
             gradients[:, i, columns[seed]] = partial

@@ -90,6 +90,19 @@ def quantity_at(problem: Problem, band: Band, x: Array, epoch: int | None = None
     return bounded(problem, band, states, numbers, epoch, others), columns
 
 
+def value_at(problem: Problem, band: Band, x: Array, epoch: int | None = None) -> Array:
+    """Return the bounded quantity (N,) at an epoch at vectors x (N, size); None is the reference time."""
+    numbers = tuple(band.coefficients[..., i] for i in range(band.coefficients.shape[-1]))
+    states = [
+        None if target is None else [tuple(jet.value for jet in state) for state in _jets(problem, target, x, {})]
+        for target in (band.target, band.other)
+    ]
+    assert states[0] is not None
+    # without derivatives, which take most of the time
+    value = bounded(problem, band, states[0], numbers, epoch, states[1])
+    return np.asarray(np.broadcast_to(value, (len(x),)))
+
+
 def _jets(problem: Problem, target: int, x: Array, columns: dict[int, int]) -> list[Components]:
     """Return position, velocity and acceleration of a target as jets, as far as it has them.
 

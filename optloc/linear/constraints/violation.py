@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
-from optloc.linear.constraints.polygons import polygon_violation
-from optloc.linear.constraints.quantities import decisive_epochs, quantity_at
+from optloc.linear.constraints.polygons import is_inside, polygon_violation
+from optloc.linear.constraints.quantities import decisive_epochs, value_at
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
@@ -39,10 +39,10 @@ def violation_of(problem: Problem, constraint: Constraint, x: Array) -> Array:
 def member_violation(problem: Problem, member: tuple[Band, ...], x: Array) -> Array:
     """Return the violation (N,) of the worst band of a conjunction at vectors x (N, size); negative if satisfied."""
     worst = np.full(len(x), -np.inf)
-    with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
+    with np.errstate(all="ignore"):
         for band in member:
             for epoch in decisive_epochs(problem, band):
-                worst = np.maximum(worst, _band_violation(band, quantity_at(problem, band, x, epoch)[0].value))
+                worst = np.maximum(worst, _band_violation(band, value_at(problem, band, x, epoch)))
     return worst
 
 
@@ -56,6 +56,20 @@ def _band_violation(band: Band, value: Array) -> Array:
         size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
         worst = np.maximum(worst, lacking / size)
     return worst
+
+
+def is_admitted(problem: Problem, x: Array) -> Array:
+    """Return flags (N,) of vectors x (N, size) that satisfy all constraints, within the accepted violation.
+
+    At the boundary of a polygon there is no such allowance, which would take most of the time.
+    """
+    out = np.ones(len(x), dtype=bool)
+    for c in problem.constraints:
+        if isinstance(c, Polygon):
+            out &= is_inside(c, plan_positions(problem, c.target, x)) != c.outside
+        else:
+            out &= violation_of(problem, c, x) <= TOLERANCE
+    return out
 
 
 def violation_names(problem: Problem) -> str:

@@ -319,18 +319,21 @@ def _departure(problem: Problem, pool: Pool) -> Array:
         items = np.flatnonzero(pool.face[:, 0] == number)
         out[items] = departure(problem.take(items), x[items], covariance[items], sides[number], centre[items])
         if len(sides[number]) > len(sides[0]):
-            out[items] = np.fmax(out[items], _departure_inwards(problem.take(items), take(pool, items))[:, None])
+            inwards, bent = _departure_inwards(problem.take(items), take(pool, items))
+            # along a bent bound the rise of the cost is not that of the cost alone
+            out[items] = np.where(bent[:, None], inwards[:, None], np.fmax(out[items], inwards[:, None]))
     return out
 
 
-def _departure_inwards(problem: Problem, pool: Pool) -> Array:
+def _departure_inwards(problem: Problem, pool: Pool) -> tuple[Array, Array]:
     """Return the departure (N,) of the cost from a Gaussian's, on the inner side of active bounds.
 
-    It is infinite if the truncated law of a fix is not valid.
+    It is infinite if the truncated law of a fix is not valid. The second result (N,) flags laws whose admitted points a
+    function tells.
     """
-    law = law_at(problem, pool)
+    law, none = law_at(problem, pool), np.zeros(len(pool), dtype=bool)
     if law is None:
-        return np.full(len(pool), np.inf)
+        return np.full(len(pool), np.inf), none
     assert pool.curvature is not None
     assert pool.curvature.free is not None
     usable = np.isfinite(pool.curvature.free).all((-1, -2)) & law.sound & law.truncated.cuts
@@ -338,7 +341,7 @@ def _departure_inwards(problem: Problem, pool: Pool) -> Array:
     if len(items):
         free, one = pool.curvature.free[items], take(law.truncated, items)
         out[items] = departure_inwards(problem.take(items), pool.x[items, 0], free, one)
-    return out
+    return out, none if law.truncated.region is None else usable & present(law.truncated.region)
 
 
 def law_at(problem: Problem, pool: Pool) -> Law | None:
