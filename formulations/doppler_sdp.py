@@ -242,6 +242,35 @@ class DopplerScene:
         values |= {"reach": np.array(reach**2)} if self.surface is None else {"form": self.surface.shape}
         return values, size
 
+    def last_pass(self, *, reach: float = 10.0, backend: str = "CLARABEL") -> tuple[Array, float, ConicAnswer]:
+        """Return the weights of the last pass and its solution.
+
+        Parameters
+        ----------
+        reach, backend
+            As in `doppler`.
+
+        Returns
+        -------
+        far : Array, shape (m,)
+            Ranges that divide the rows, scaled.
+        size : float
+            Unit of the cost.
+        answer : ConicAnswer
+            The solution; of the first pass if that failed.
+        """
+        relaxation, far = _relaxation(self.shape, backend), np.ones(len(self.pivot))
+        for _ in range(_PASSES):
+            given, size = self.parameters(far, reach)
+            answer = relaxation.solve(given, reach=self.longest(reach))
+            # value and bound of a pass belong to the ranges that divided its rows
+            weighted, lift = far, answer.values["lift"]
+            if not np.isfinite(lift).all():
+                break
+            apart = np.sqrt(((lift[0, 1 : 1 + self.shape.dimension] - self.place) ** 2).sum(axis=1))
+            far = np.where(self.pivot < 0, 1.0, np.maximum(apart[self.pivot], _NEAREST))
+        return weighted, size, answer
+
     def points(self, lift: Array) -> Array:
         """Return points (1 + 2 d, d) in the units of the caller: the first moment of a lift, then points around it."""
         d = self.shape.dimension
@@ -352,44 +381,10 @@ def doppler(
     if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
         return _no_start(S.shape[1], A.shape, None)
     scene = DopplerScene.of(S, V, values, W, R, Q, A, surface)
-    far, size, answer = last_pass(scene, reach=reach, backend=backend)
+    far, size, answer = scene.last_pass(reach=reach, backend=backend)
     if not np.isfinite(answer.values["lift"]).all():
         return _no_start(S.shape[1], A.shape, answer)
     return _read_off(scene, far, size, answer)
-
-
-def last_pass(
-    scene: DopplerScene, *, reach: float = 10.0, backend: str = "CLARABEL"
-) -> tuple[Array, float, ConicAnswer]:
-    """Return the weights of the last pass and its solution.
-
-    Parameters
-    ----------
-    scene : DopplerScene
-        The scaled rows.
-    reach, backend
-        As in `doppler`.
-
-    Returns
-    -------
-    far : Array, shape (m,)
-        Ranges that divide the rows, scaled.
-    size : float
-        Unit of the cost.
-    answer : ConicAnswer
-        The solution; of the first pass if that failed.
-    """
-    relaxation, far = _relaxation(scene.shape, backend), np.ones(len(scene.pivot))
-    for _ in range(_PASSES):
-        given, size = scene.parameters(far, reach)
-        answer = relaxation.solve(given, reach=scene.longest(reach))
-        # value and bound of a pass belong to the ranges that divided its rows
-        weighted, lift = far, answer.values["lift"]
-        if not np.isfinite(lift).all():
-            break
-        apart = np.sqrt(((lift[0, 1 : 1 + scene.shape.dimension] - scene.place) ** 2).sum(axis=1))
-        far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
-    return weighted, size, answer
 
 
 def _read_off(scene: DopplerScene, far: Array, size: float, answer: ConicAnswer) -> DopplerStart:

@@ -13,6 +13,7 @@ import numpy as np
 
 from optloc.base.records import join
 from optloc.base.types import Status
+from optloc.base.units import UNITS
 from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
 from optloc.files.reader import Loaded
@@ -165,13 +166,23 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
     motions, n = loaded.problem.motions, 1 if first is None else len(fix)
     # A file with known targets only (a calibration) has one row for each target.
     shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
-    return tables.fix_columns(
+    found = tables.fix_columns(
         fix,
         targets=[(i, state_names(i, len(motions), motions[i].order)) for i in shown],
         labels=lambda target, spread: _labels(loaded, n, first, target, spread),
         dimension=loaded.problem.dimension,
         constrained=bool(loaded.problem.constraints),
     )
+    return found | in_unit_of_stations(loaded, found)
+
+
+def in_unit_of_stations(loaded: Loaded, columns: Columns) -> Columns:
+    """Return the coordinates in the unit of the stations, such as `x_cm`; empty for metres and for problem files."""
+    unit = loaded.table.get("unit")
+    if unit is None:
+        return {}
+    size = UNITS["length"][unit]
+    return {f"{axis}_{unit}": np.asarray(columns[axis], dtype=float) / size for axis in "xyz" if axis in columns}
 
 
 def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool) -> Columns:

@@ -19,6 +19,7 @@ from optloc.cli.file_fixes import (
     FileFixes,
     fix_file,
     fixes_json,
+    in_unit_of_stations,
     results_of,
 )
 from optloc.cli.from_table import read_problem
@@ -33,6 +34,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files.constraint_table import ConstraintTable
+from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
@@ -105,8 +107,7 @@ def run_fix(
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
-    loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
-    loaded = replace(loaded, floors=floors)
+    loaded = replace(read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output), floors=floors)
     claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
@@ -122,9 +123,8 @@ def run_fix(
     if quiet and not as_json:
         return 0 if found.passes(allow) else 1
     # the search for causes takes time, so do it only if the result is printed
-    level = rescaled or _level_of(found)
+    level, signals = rescaled or _level_of(found), signals or _late_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
-    signals = signals or _late_of(found)
     advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
@@ -184,7 +184,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
     sheet = fix_sheet(fix, found.columns, found.loaded.title)
     rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
-    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed else []
+    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed not in ("", NOT_STATED) else []
     table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
     colour = _CARE if fix.unchecked and fix.status is Status.OK else _colour(Status(int(fix.code)))
     table.add_row("status", Text(rows[0][1], style=f"bold {colour}"))
@@ -192,6 +192,12 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
         table.add_row(*row)
     console.print(table)
     _show_sheet(bias_sheet(fix, found.seen, found.loaded.bias_unit), console)
+    converted = in_unit_of_stations(found.loaded, found.columns)
+    if converted and len(found.columns["x"]) == 1 and np.isfinite(found.columns["x"]).all():
+        parts = [(*name.split("_", 1), float(values[0])) for name, values in converted.items()]
+        say(
+            console, "The position is " + ", ".join(f"{axis} = {value:.6g} {unit}" for axis, unit, value in parts) + "."
+        )
     say_all(console, () if found.seen is None else found.seen.sentences)
     _show_sheet(suspect_sheet(fix), console)
     _show_unnoticed(found, fix, console)

@@ -18,6 +18,9 @@ from optloc.files.wave_speed import StatedSpeed, stated_speed, wind_of
 from optloc.models.medium import Atmosphere, Layers, Medium, Wind
 from optloc.problem.bias import SPEED, scale_of
 
+NOT_STATED = f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)"
+"""Text of the wave speed of a file that states none."""
+
 # Keys of each kind of medium.
 _MEDIA = {
     "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
@@ -70,7 +73,7 @@ def speed_words(file: ProblemFile, source: str) -> str:
         return f"{stated.words}; wind ({parts}) m/s"
     if medium is not None:
         return medium.words
-    return f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)" if stated is None else stated.words
+    return NOT_STATED if stated is None else stated.words
 
 
 def medium_of(table: MediumTable, reference: float | None, place: str) -> Medium:

@@ -85,9 +85,14 @@ class TableProblem:
 
     @property
     def as_read(self) -> dict[str, Any]:
-        """Return the interpretation of the table as a JSON value."""
+        """Return the interpretation of the table as a JSON value.
+
+        It has the unit of the stations if results in it are expected: not metres, and not on Earth.
+        """
         pairs = [list(pair) for pair in self.about]
-        return {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
+        other = self.places.unit if self.places.frame == "cartesian" and self.places.unit != "m" else None
+        found = {"understood": pairs, "notes": list(self.notes), "columns": dict(self.uses)}
+        return found if other is None else found | {"unit": other}
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
         """Return the problem, equal to the problem that `read` returns for the written files.
@@ -107,7 +112,9 @@ class TableProblem:
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
         made = assemble(file, stations, tables, out.name, values=True, more=more)
         loaded = replace(made, loaded=replace(made.loaded, source=self.source.name)).plausible("table")
-        return replace(loaded, table=self.as_read)
+        # of S minus P, the report names the speeds of both waves
+        speed = loaded.speed if any(word == "wave" for word, _ in self.about) else ""
+        return replace(loaded, table=self.as_read, speed=speed)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file and its tables, and return their paths."""

@@ -48,7 +48,7 @@ def with_wave(problem: TableProblem, wave: WaveOptions) -> TableProblem:
     if wave.two_way:
         sections = _two_way(sections, wave)
         words += ", there and back" + (f", {wave.turn_around} less" if wave.turn_around else "")
-    about = problem.about + ((("wave speed", words),) if depends and not picks else ())
+    about = problem.about + ((("wave", words),) if depends and not picks else ())
     return replace(problem, sections=sections, lines=tuple(lines), after=tuple(after), about=about)
 
 

@@ -81,3 +81,25 @@ def test_a_column_of_the_reference_in_a_wide_table_is_left_out(tmp_path):
     path = written(tmp_path, ",".join(f"{name}_tdoa_m" for name in at) + f"\n{cells}\n{cells}\n")
     found = interpret_table(path, ColumnHints(tmp_path / "st.csv", "1 m", reference="R1"))
     assert "zero readings of the reference station R1 to itself are left out: 2" in found.notes
+
+
+def test_results_are_also_in_the_unit_of_the_stations(tmp_path):
+    import csv
+    import json
+
+    from typer.testing import CliRunner
+
+    from optloc.cli import app
+
+    rows = "".join(f"{name},{100 * x},{100 * y}\n" for name, (x, y) in STATIONS.items())
+    (tmp_path / "cm.csv").write_text("name,x_cm,y_cm\n" + rows)
+    ranges = "".join(f"{name},{100 * math.dist(place, TARGET):.1f}\n" for name, place in STATIONS.items())
+    (tmp_path / "t.csv").write_text("station,range_cm\n" + ranges)
+    words = ["fix", str(tmp_path / "t.csv"), "--stations", str(tmp_path / "cm.csv"), "--sigma", "5 cm"]
+    shown = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out.csv")])
+    assert "The position is x = 400000 cm, y = 300000 cm." in shown.stdout
+    fix = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["fixes"][0]
+    assert [fix["x_cm"], fix["y_cm"]] == pytest.approx([4e5, 3e5], abs=1.0)
+    assert [fix["x"], fix["y"]] == pytest.approx(TARGET, abs=0.01)
+    with (tmp_path / "out.csv").open() as file:
+        assert float(next(csv.DictReader(file))["x_cm"]) == pytest.approx(4e5, abs=1.0)

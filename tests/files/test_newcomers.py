@@ -271,7 +271,10 @@ WRONG = {
         {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": {}},
         "not a height",
     ),
-    "a speed that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "wave_speed": "fast"}, "wave_speed"),
+    "a speed that is none": (
+        {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "wave_speed": "fast"},
+        "wave_speed",
+    ),
     "a unit that is none": (
         {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": [1]},
         "list is not text",

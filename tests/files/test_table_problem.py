@@ -32,7 +32,12 @@ def test_what_is_written_is_what_is_read(tmp_path):
     for loaded in (direct, written):
         assert loaded.problem.z.tolist() == [5000.0, 6000.0, 7000.0]
         assert np.array_equal(loaded.problem.stations.position[0], 1000.0 * np.stack([PLACES["x"], PLACES["y"]], -1))
-    assert direct.table == {"understood": [["range", "3 readings"]], "notes": ["a note"], "columns": {}}
+    assert direct.table == {
+        "understood": [["range", "3 readings"]],
+        "notes": ["a note"],
+        "columns": {},
+        "unit": "km",
+    }
 
 
 def test_a_table_without_sigma_is_told_how_to_say_it():

@@ -81,12 +81,12 @@ def test_transponders_on_the_seabed_find_the_vehicle(tmp_path):
 
 def test_the_report_always_names_the_speed_of_times(tmp_path):
     table = interpret_table(*hints(tmp_path, SQUARE, EQUAL, sigma="0.1 ns"))
-    assert ("wave speed", "299792458 m/s, light (no --wave-speed)") in table.about
+    assert ("wave", "299792458 m/s, light (no --wave-speed)") in table.about
     table = interpret_table(*hints(tmp_path, SQUARE, EQUAL, WaveOptions("air:20C,50%"), sigma="0.1 ms"))
-    assert dict(table.about)["wave speed"] == "343.987 m/s, air of 20 °C, 50 % humid (Cramer 1993)"
-    assert table.read().speed == dict(table.about)["wave speed"]
+    assert dict(table.about)["wave"] == "343.987 m/s, air of 20 °C, 50 % humid (Cramer 1993)"
+    assert table.read().speed == dict(table.about)["wave"]
     metres = interpret_table(*hints(tmp_path, SQUARE, "station,range_m\nA,14\nB,14\nC,14\n", sigma="1 m"))
-    assert "wave speed" not in dict(metres.about)
+    assert "wave" not in dict(metres.about)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_two_way_times_lose_the_turn_around_and_half_of_the_way(tmp_path):
     assert problem.z == pytest.approx(again.z)
     assert problem.noise.blocks[0].covariance == pytest.approx(again.noise.blocks[0].covariance)
     table = interpret_table(*hints(tmp_path, SEABED, rows, wave, sigma="0.04 ms"))
-    assert dict(table.about)["wave speed"] == "1500 m/s, there and back, 5 ms less"
+    assert dict(table.about)["wave"] == "1500 m/s, there and back, 5 ms less"
 
 
 WRONG = {
@@ -169,7 +169,7 @@ def test_a_wind_on_earth_blows_along_east_and_north(tmp_path):
     axes = problem.frame.enu_axes(problem.stations.position[0].mean(0))
     assert axes @ np.array(problem.medium.velocity) == pytest.approx([5.0, 0.0, 0.0], abs=1e-9)
     table = interpret_table(*hints(tmp_path, stations, rows, wave, sigma="1 ms"))
-    assert dict(table.about)["wave speed"] == "340 m/s; wind (5, 0) m/s"
+    assert dict(table.about)["wave"] == "340 m/s; wind (5, 0) m/s"
 
 
 def test_light_stays_the_default_of_networks_that_are_large_enough(tmp_path):

@@ -126,7 +126,7 @@ def test_options_replace_the_statements_of_a_file():
     assert (file.measurements[0].two_way, file.measurements[0].turn_around) == (True, "2 ms")
     assert with_options(file, None) is file
     assert with_options(file, WaveOptions()) is file
-    with pytest.raises(InvalidProblem, match="--wave-speed: .*no wave speed"):
+    with pytest.raises(InvalidProblem, match=r"--wave-speed: .*no wave speed"):
         with_options(file, WaveOptions("fast"))
     lines = document(measurements=[{"kind": "azimuth", "rows": []}])
     with pytest.raises(InvalidProblem, match="--turn-around: the file has no ranges"):

@@ -201,10 +201,10 @@ def test_locate_takes_layers():
         {"A": (0, 0, -5), "B": (900, 0, -5), "C": (0, 900, -5), "D": (900, 900, -60), "E": (400, 300, -150)},
         toa=dict(zip("ABCDE", [0.4, 0.45, 0.5, 0.55, 0.33], strict=True)),
         sigma=0.05,
-        speed=SEA,
+        wave_speed=SEA,
     )
     assert fix.layout.find("emission")[0].unit == "m"
-    with pytest.raises(InvalidProblem, match="Layers"):
+    with pytest.raises(InvalidProblem, match="no wave speed"):
         optloc.locate({"A": (0, 0, 0)}, ranges={"A": 1.0}, sigma=1.0, wave_speed="sound")
 
 

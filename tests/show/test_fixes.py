@@ -74,7 +74,7 @@ def test_alternatives_on_earth_have_latitude_longitude_and_height():
     fix = optloc.solve(optloc.assemble(places, rows, frame=site))
     mirror = site.to_geodetic(fix.position * [1.0, 1.0, -1.0])
     (other,) = fix_detail(fix)["alternatives"]
-    assert other["latlon"] == pytest.approx([*np.degrees(mirror[:2]), mirror[2]], abs=1e-6)
+    assert other["latlon"] == pytest.approx([*np.degrees(mirror[:2]).tolist(), float(mirror[2])], abs=1e-6)
     sheet = alternative_sheet(fix)
     assert sheet is not None
     assert sheet.head[1] == "latitude, longitude, height in m"

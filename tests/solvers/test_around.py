@@ -17,8 +17,8 @@ TARGET = np.array([400.0, 300.0])
     ("limits", "side"),
     [
         (constraints.disc(TARGET, 50.0), "upper"),
-        (constraints.polyline(TARGET + [[0.0, 0.0], [90.0, 0.0], [90.0, 90.0]], 9.0), (1, 0, "upper")),
-        (constraints.keep_out_polygon(TARGET + [[0.0, 0.0], [90.0, 0.0], [90.0, 90.0]]), 1),
+        (constraints.polyline(TARGET + np.array([[0.0, 0.0], [90.0, 0.0], [90.0, 90.0]]), 9.0), (1, 0, "upper")),
+        (constraints.keep_out_polygon(TARGET + np.array([[0.0, 0.0], [90.0, 0.0], [90.0, 90.0]])), 1),
     ],
 )
 def test_starts_are_on_the_bound(limits, side):

@@ -402,7 +402,7 @@ def test_a_known_height_is_held_by_every_update():
 
 
 def test_other_equalities_are_refused():
-    problem = replace(run(np.arange(4.0)), constraints=box([-1e4, -1e4, 150.0], [1e4, 1e4, 150.0]))
+    problem = replace(run(np.arange(4.0)), constraints=box([150.0, -1e4, -1e4], [150.0, 1e4, 1e4]))
     with pytest.raises(InvalidProblem, match="equality"):
         tracked(problem, polynomial(1))
 

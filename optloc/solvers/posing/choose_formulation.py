@@ -54,6 +54,10 @@ def pose(problem: Problem, formulation: str) -> Posed:
 
 def _single(problem: Problem) -> Problem:
     """Return a problem as a flat batch of one; raise InvalidProblem for a batch, or for numbers that are not finite."""
+    if not isinstance(problem, Problem):
+        raise InvalidProblem(
+            f"{type(problem).__name__} is no problem", "problem", "make one by optloc.assemble or load"
+        )
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):

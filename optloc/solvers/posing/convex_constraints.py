@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band, Constraint
+from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
 from optloc.linear.constraints import conjunction, is_conjunctive
+from optloc.linear.constraints.polygons import edge_of, is_convex, sense_of
 from optloc.problem.problem import Problem
 
 
@@ -71,6 +72,27 @@ def conjunction_of(problem: Problem, constraint: Constraint) -> list[Band]:
             "state it in the problem and use optloc.solve, which tries every region",
         )
     return conjunction(replace(problem, constraints=(constraint,)))
+
+
+def members_of(problem: Problem, constraint: Constraint) -> list[list[Band]]:
+    """Return the members of a constraint, each a conjunction of bands; the target is in one of them at least.
+
+    Raises
+    ------
+    InvalidProblem
+        For a polygon that is not convex: neither it nor its outside is a list of such members here.
+    """
+    if isinstance(constraint, AnyOf):
+        return [list(member) for member in constraint.members]
+    if isinstance(constraint, Polygon) and constraint.outside and is_convex(replace(constraint, outside=False)):
+        sign = sense_of(replace(constraint, outside=False))
+        edges = [edge_of(constraint, i) for i in range(len(constraint.vertices))]
+        above, without = [sign * edge.upper for edge in edges], np.array(np.inf)
+        return [
+            [replace(edge, coefficients=sign * edge.coefficients, lower=low, upper=without)]
+            for edge, low in zip(edges, above, strict=True)
+        ]
+    return [conjunction_of(problem, constraint)]
 
 
 def _of_band(problem: Problem, band: Band) -> list[ConvexSet]:

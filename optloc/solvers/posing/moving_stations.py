@@ -113,7 +113,7 @@ def _by_slot(layout: Layout, column: Array, values: Any) -> dict[str, Any]:
 def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
     """Return the last pass of the relaxation of a flat batch of one source at rest; `locate` is not used."""
     from formulations.conic import rank_ratio
-    from formulations.doppler_sdp import DopplerScene, doppler_problem, last_pass, settings_of
+    from formulations.doppler_sdp import DopplerScene, doppler_problem, settings_of
 
     rows = limited_rows(problem)
     if rows is None:
@@ -130,7 +130,7 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
         given["design"],
         surface,
     )
-    far, size, answer = last_pass(scene, reach=_REACH)
+    far, size, answer = scene.last_pass(reach=_REACH)
     if not np.isfinite(answer.primal):
         raise InvalidProblem("the first pass of the relaxation has no solution", "formulation", 'use "nls"')
     change, gram, size = _whitened((scene.whiten @ (scene.rows / far[:, None])), size)

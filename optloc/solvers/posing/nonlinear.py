@@ -6,8 +6,9 @@ vector, the variables of the program.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice, product
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import METHODS, Method
-from optloc.solvers.posing.convex_constraints import conjunction_of
+from optloc.solvers.posing.convex_constraints import members_of
 from optloc.solvers.posing.convex_statement import Relation
 from optloc.solvers.posing.posed import Posed
 from optloc.solvers.scaled_program import ScaledProblem
@@ -42,6 +43,8 @@ _FROM_SOLUTION = {
 # Largest residual of the optimality conditions at which a point is a solution, although the solver reports that it
 # stopped early: IPOPT cannot always meet its tolerance of 1e-10.
 _STATIONARY = 1e-7
+# Most combinations of members of unions, each a program: a road of fifty pieces.
+_MOST = 50
 # Places around the start at which gradients set the unit of a relation: the gradient of a distance has none at its
 # centre.
 _SHIFTS = (0.0, 0.137, -0.211)
@@ -79,6 +82,7 @@ class PosedProgram(Posed):
         )
         self._vector = self._base.x * scaled_problem.unit + scaled_problem.centre
         self._starts: Array | None = None
+        self._unions: dict[str, list[Relation]] = {}
         self._restate()
         for constraint in stated.constraints:
             try:
@@ -198,7 +202,8 @@ class PosedProgram(Posed):
                 "write a relation such as posed.position[0] <= 100",
             )
         pairs = []
-        for one in constraint.nonzeros():
+        elements: list[Any] = constraint.nonzeros()
+        for one in elements:
             if one.is_constant() or one.op() not in (ca.OP_LE, ca.OP_LT, ca.OP_EQ):
                 raise InvalidProblem(
                     "the expression is no relation", "constraint", "write left <= right, left >= right or left == right"
@@ -255,9 +260,16 @@ class PosedProgram(Posed):
 
     def _table_relation(self, constraint: Any, name: str) -> Relation:
         """Return a constraint of the table as expressions of CasADi, in units of length."""
+        members = [self._of_bands(bands, name) for bands in members_of(self.stated, constraint)]
+        if len(members) > 1:
+            self._unions[name] = members
+        return members[0]
+
+    def _of_bands(self, bands: Sequence[Band], name: str) -> Relation:
+        """Return a conjunction of bands as expressions of CasADi, in units of length."""
         parts: list[tuple[Any, bool]] = []
         divisor: list[Array] = []
-        for band in [constraint] if isinstance(constraint, Band) else conjunction_of(self.stated, constraint):
+        for band in bands:
             one = replace(self._own.problem, constraints=(band,))
             equal, more = constrained(one, self._vector, bounds(one), self.unit)
             unit = self.unit if _is_length(band) else 1.0
@@ -294,44 +306,69 @@ class PosedProgram(Posed):
         refine: bool | None = None,
     ) -> Fix:
         """Return the judged fix of the posed problem; see `Posed.solve`."""
-        from formulations.backend import Choice, SolverError
-
         name = (solver or "ipopt").lower()
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
         own = {**(_SETTINGS if name == "ipopt" else {}), **(settings or {})}
         if warm and name == "ipopt" and duals is not None:
             own = {**_FROM_SOLUTION, **own}
-        choice = None if name == "ipopt" else Choice("nonlinear", name, own)
-        try:
-            program = Program.of(self._program, self._statement, choice=choice, settings=own)
-        except RuntimeError as trouble:
-            text = str(trouble).partition("\n")[0][:200]
-            raise InvalidProblem(
-                f"CasADi cannot use {name!r} with these settings: {text}", "solver", "see optloc list solvers"
-            ) from None
-        multipliers = None if duals is None or not warm else (np.zeros(program.n), self._multipliers(duals))
-        found: list[Local] = []
-        trouble_text = ""
-        for one in self._candidates() if start is None or not warm else [self._vector_of(start)]:
-            y = (one - self._own.centre) / self._own.unit
-            try:
-                found.append(
-                    program.solve(
-                        y, self._own.z, self._own.weight, self._own.data, prior=self._own.prior, multipliers=multipliers
-                    )
-                )
-            except SolverError as trouble:
-                trouble_text = str(trouble)
-        found = [self._checked(one) for one in found]
-        if not found:
-            return self._failed(Status.NUMERICAL, trouble_text, self._answer(None, name, trouble_text))
-        best = min(found, key=lambda one: (not one.success, one.cost if np.isfinite(one.cost) else np.inf))
+        starts = self._candidates() if start is None or not warm else self._vector_of(start)[None]
+        given = duals if warm else None
+        ends: list[tuple[Local, tuple[Relation, ...]]] = []
+        trouble = ""
+        # one program for each member of the unions
+        for members in islice(product(*self._unions.values()), _MOST):
+            self._take_members(members)
+            found, trouble = self._solve_from(starts, name, own, given)
+            ends += [(one, members) for one in found]
+        if not ends:
+            return self._failed(Status.NUMERICAL, trouble, self._answer(None, name, trouble))
+        ends.sort(key=lambda end: (not end[0].success, end[0].cost if np.isfinite(end[0].cost) else np.inf))
+        best, members = ends[0]
+        self._take_members(members)
         answer = self._answer(best, name, "")
         if not best.success:
             return self._explain_failure(best, answer)
-        others = sorted((one for one in found if one.success), key=lambda one: one.cost)
-        x = np.stack([self._own.centre + self._own.unit * one.x for one in others])
+        x = np.stack([self._own.centre + self._own.unit * one.x for one, _ in ends if one.success])
         return self._conclude(self._whole(x), answer, refine)
+
+    def _take_members(self, members: Sequence[Relation]) -> None:
+        """State the problem with one member of each union."""
+        if members:
+            self.relations.update({one.name: one for one in members})
+            self._restate()
+
+    def _solve_from(
+        self, starts: Array, name: str, settings: Mapping[str, Any], duals: Mapping[str, float | Array] | None
+    ) -> tuple[list[Local], str]:
+        """Return the ends of the solver `name` from starts (q, size) in SI units, and the last error of the solver.
+
+        `duals` are first multipliers; None for none.
+        """
+        import casadi as ca
+
+        from formulations.backend import Choice, SolverError
+
+        if not ca.has_nlpsol(name):  # without this question, CasADi would print all folders that it searches
+            raise InvalidProblem(f"CasADi has no nonlinear solver {name!r}", "solver", "see 'optloc list solvers'")
+        choice = None if name == "ipopt" else Choice("nonlinear", name, settings)
+        try:
+            program = Program.of(self._program, self._statement, choice=choice, settings=settings)
+        except RuntimeError:  # CasADi raises no other type
+            given = ", ".join(settings)
+            raise InvalidProblem(
+                f"{name} does not accept the settings {given}", "settings", "check their names"
+            ) from None
+        own, ends, failure = self._own, list[Local](), ""
+        multipliers = None if duals is None else (np.zeros(program.n), self._multipliers(duals))
+        for one in starts:
+            y = (one - own.centre) / own.unit
+            try:
+                end = program.solve(y, own.z, own.weight, own.data, prior=own.prior, multipliers=multipliers)
+            except SolverError as trouble:
+                failure = str(trouble)
+            else:
+                ends.append(self._checked(end))
+        return ends, failure
 
     def _checked(self, found: Local) -> Local:
         """Return a local solution, as a success if its point is stationary although the solver stopped early."""
@@ -347,14 +384,19 @@ class PosedProgram(Posed):
 
     def _vector_of(self, start: Any) -> Array:
         """Return a vector (size,) in SI units from an earlier fix, a vector or a position."""
-        value = np.asarray(start.x if isinstance(start, Fix) else self._of_answer(start), dtype=float).ravel()
+        try:
+            value = np.asarray(start.x if isinstance(start, Fix) else self._of_answer(start), dtype=float).ravel()
+        except (TypeError, ValueError):
+            raise InvalidProblem(
+                "start is no vector of numbers", "start", "give a fix, a vector or a position"
+            ) from None
         size, layout = self._program.n, self._own.problem.layout
         if len(value) == size:
             return value
         if len(value) == layout.n_shared:
-            return np.asarray(complete(self._own.problem, value[None, None])[0, 0])
+            return np.asarray(complete(self._own.problem, value[None, None])[0, 0], dtype=float)
         if len(value) == len(self.origin):
-            out = self._candidates()[0].copy()
+            out: Array = self._candidates()[0].copy()
             slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
             out[slot.start : slot.start + slot.size] = value
             return out
@@ -372,6 +414,9 @@ class PosedProgram(Posed):
         """Return the multipliers (equalities, inequalities) of named duals; zeros for the other constraints."""
         first: list[float] = []
         second: list[float] = []
+        unknown = [name for name in duals if name not in self.relations]
+        if unknown:
+            raise InvalidProblem(f"there is no constraint {unknown[0]!r}", "duals", "use fix.posed.duals")
         for name, one in self.relations.items():
             given = np.ravel(duals.get(name, np.zeros(len(one.parts))))
             if len(given) != len(one.parts):

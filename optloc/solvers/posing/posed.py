@@ -11,6 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.linear.constraints import is_conjunctive
 from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
@@ -153,6 +154,9 @@ class Posed(ABC):
         named = [(one.name if name is None else name, one) for one in members]
         for label in dict.fromkeys(label for label, _ in named):
             self._new_name(label)
+        for label, one in named:
+            if not is_conjunctive(one) and sum(label == other for other, _ in named) > 1:
+                raise InvalidProblem(f"{label!r} names a union and another constraint", "name", "add them one by one")
         kept = tuple(one if one.name == label else replace(one, name=label) for label, one in named)
         stated = replace(self.stated, constraints=(*self.stated.constraints, *kept))
         check_constraints(stated)
@@ -170,6 +174,8 @@ class Posed(ABC):
             name = next(
                 text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
             )
+        if not isinstance(name, str):
+            raise InvalidProblem(f"the name {name!r} is no text", "name", "give a text such as 'fence'")
         if name in self.relations:
             raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
         return name

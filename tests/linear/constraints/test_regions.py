@@ -50,11 +50,11 @@ def test_a_ground_is_a_table_of_its_band():
 @pytest.mark.parametrize(
     ("limits", "distance"),
     [
-        (constraints.disc(TARGET + [0.0, 50.0], 30.0), 20.0),
-        (constraints.keep_out_disc(TARGET + [0.0, 20.0], 30.0), 10.0),
-        (constraints.annulus(TARGET + [0.0, 50.0], 30.0, 30.0), 20.0),
-        (constraints.polyline(TARGET + [[-90.0, 40.0], [0.0, 40.0], [90.0, 40.0]], 15.0), 25.0),
-        (constraints.keep_out_polygon(TARGET + [[-90, -9], [90, -9], [90, 90], [-90, 90]]), 9.0),
+        (constraints.disc(TARGET + np.array([0.0, 50.0]), 30.0), 20.0),
+        (constraints.keep_out_disc(TARGET + np.array([0.0, 20.0]), 30.0), 10.0),
+        (constraints.annulus(TARGET + np.array([0.0, 50.0]), 30.0, 30.0), 20.0),
+        (constraints.polyline(TARGET + np.array([[-90.0, 40.0], [0.0, 40.0], [90.0, 40.0]]), 15.0), 25.0),
+        (constraints.keep_out_polygon(TARGET + np.array([[-90, -9], [90, -9], [90, 90], [-90, 90]])), 9.0),
     ],
 )
 def test_a_fix_without_noise_is_near_the_nearest_admitted_point(limits, distance):
@@ -66,9 +66,9 @@ def test_a_fix_without_noise_is_near_the_nearest_admitted_point(limits, distance
 def test_a_bound_that_changes_nothing_leaves_the_fix_and_its_status():
     free = solve(ranges_to(TARGET))
     for limits in (
-        constraints.keep_out_disc(TARGET + [300.0, 0.0], 50.0),
-        constraints.polyline(TARGET + [[-300.0, -300.0], [0.0, 10.0], [300.0, 300.0]], 200.0),
-        constraints.keep_out_polygon(TARGET + [[200.0, 0.0], [300.0, 0.0], [300.0, 90.0]]),
+        constraints.keep_out_disc(TARGET + np.array([300.0, 0.0]), 50.0),
+        constraints.polyline(TARGET + np.array([[-300.0, -300.0], [0.0, 10.0], [300.0, 300.0]]), 200.0),
+        constraints.keep_out_polygon(TARGET + np.array([[200.0, 0.0], [300.0, 0.0], [300.0, 90.0]])),
     ):
         fix = solve(ranges_to(TARGET, limits))
         assert (str(fix.status), fix.active[()]) == ("ok", ())
@@ -78,7 +78,7 @@ def test_a_bound_that_changes_nothing_leaves_the_fix_and_its_status():
 def test_a_batch_has_one_answer_for_each_problem():
     rng = np.random.default_rng(3)
     z = np.linalg.norm(PLANE - TARGET, axis=1) + 10.0 * rng.standard_normal((5, 4))
-    limits = constraints.polyline(TARGET + [[-90.0, 40.0], [0.0, 10.0], [90.0, 40.0]], 8.0)
+    limits = constraints.polyline(TARGET + np.array([[-90.0, 40.0], [0.0, 10.0], [90.0, 40.0]]), 8.0)
     together = solve(assemble(PLANE, measured("range", z, a=range(4), sigma=10.0), constraints=limits))
     for i in range(5):
         alone = solve(ranges_to(TARGET, limits, z=z[i]))

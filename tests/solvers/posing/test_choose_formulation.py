@@ -110,6 +110,8 @@ def test_what_cannot_be_posed_is_refused_by_a_sentence():
     problem = differences(1)
     with pytest.raises(InvalidProblem, match="2 problems are a batch"):
         pose(problem.flat().take(np.array([0, 0])), "nls")
+    with pytest.raises(InvalidProblem, match="str is no problem"):
+        pose("problem", "nls")
     with pytest.raises(InvalidProblem, match="unknown formulation"):
         pose(problem, "hul")
     for name in (

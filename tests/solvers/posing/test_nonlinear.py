@@ -1,5 +1,7 @@
 """Nonlinear programs in the open: symbols, slots, relations, starts, and solves that fail."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -67,12 +69,32 @@ def test_what_cannot_be_added_or_minimised():
     for goal, what in ((posed.residual, "not a scalar"), (ca.SX(2.0), "no unknown"), ("cost", "no expression")):
         with pytest.raises(InvalidProblem, match=what):
             posed.minimise(goal)
-    with pytest.raises(InvalidProblem, match="cannot use 'nosuch'"):
+    with pytest.raises(InvalidProblem, match="no nonlinear solver 'nosuch'"):
         posed.solve("nosuch")
+    with pytest.raises(InvalidProblem, match="does not accept the settings"):
+        posed.solve(settings={"nosuch": 1})
+    with pytest.raises(InvalidProblem, match="no constraint 'other'"):
+        posed.solve(duals={"other": 1.0})
+    with pytest.raises(InvalidProblem, match="no vector of numbers"):
+        posed.solve(start="here")
     with pytest.raises(InvalidProblem, match="start has 5 numbers"):
         posed.solve(start=np.zeros(5))
     with pytest.raises(InvalidProblem, match="union"):
-        posed.add(constraints.keep_out_polygon(np.array([[-5.0, -5.0], [5.0, -5.0], [0.0, 5.0]])))
+        posed.add(constraints.keep_out_polygon(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 1.0], [0.0, 9.0]])))
+
+
+def test_every_member_of_a_union_is_tried():
+    problem = ranged(6)
+    free = solve(problem).position
+    square = free + 15.0 * np.array([[-1.0, -1.0], [1.2, -1.0], [1.2, 1.0], [-1.0, 1.0]])
+    road = free + np.array([[-900.0, 30.0], [0.0, 20.0], [900.0, -500.0]])
+    for one in (constraints.keep_out_polygon(square), constraints.polyline(road, 5.0)):
+        posed = pose(problem, "nls")
+        posed.add(one, name="it")
+        fix, expected = posed.solve(), solve(replace(problem, constraints=one))
+        assert fix.position == pytest.approx(expected.position, abs=1e-4)
+        assert fix.posed.value == pytest.approx(float(expected.cost), rel=1e-6)
+        assert np.max(fix.posed.duals["it"]) > 0.0
 
 
 def test_failed_solves_are_statuses():
