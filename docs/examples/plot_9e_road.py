@@ -6,8 +6,6 @@ Three receivers on a line measure the distance to a car. Two positions fit, one 
 them is on the road, so the road decides.
 """
 
-import numpy as np
-
 import optloc
 from optloc import constraints
 from optloc.show.pictures import plot_fixes
