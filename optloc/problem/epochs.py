@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import AnyOf, Array, Bias, Constraint, Motion, Polygon, Rows, Stations
+from optloc.base.types import Array, Bias, Motion, Rows, Stations
 from optloc.problem.noise import Block, Noise, group
-from optloc.problem.problem import Problem
+from optloc.problem.problem import Problem, spread_over_epochs
 
 # Epochs without shared unknowns become a batch of problems with one epoch each.
 
@@ -127,7 +127,7 @@ def states_by_epoch(problem: Problem) -> Problem:
     priors = tuple(
         replace(p, mean=_add_epoch_axis(p.mean, 1), covariance=_add_epoch_axis(p.covariance, 2)) for p in problem.priors
     )
-    constraints = tuple(_spread_constraint(c, problem.motions[c.target].rise) for c in problem.constraints)
+    constraints = tuple(spread_over_epochs(c, problem.motions[c.target].rise) for c in problem.constraints)
     spread = _add_epoch_axis
     fences = tuple(
         replace(f, normal=spread(f.normal, 1), offset=spread(f.offset, 0), sigma=spread(f.sigma, 0))
@@ -135,18 +135,6 @@ def states_by_epoch(problem: Problem) -> Problem:
     )
     bare = replace(problem, rows=(), noise=Noise(()), biases=(), times=np.zeros(1))
     return replace(bare, stations=stations, motions=motions, priors=priors, constraints=constraints, fences=fences)
-
-
-def _spread_constraint(c: Constraint, rise: Array | None) -> Constraint:
-    """Return a constraint for each epoch; `rise` (..., k, 2) is the known change of height, m, and its rate, m/s."""
-    if isinstance(c, Polygon):
-        return c
-    if isinstance(c, AnyOf):
-        spread = [tuple(_spread_constraint(band, rise) for band in member) for member in c.members]
-        return replace(c, members=tuple(spread))  # type: ignore[arg-type]  # bands stay bands
-    rise_of_height = 0.0 if rise is None or not c.along else rise[..., 0]
-    lower, upper = (_add_epoch_axis(bound, 0) + rise_of_height for bound in (c.lower, c.upper))
-    return replace(c, lower=lower, upper=upper, coefficients=_add_epoch_axis(c.coefficients, 1))
 
 
 def without_epoch_correlation(problem: Problem) -> Problem:

@@ -431,6 +431,20 @@ def map_numbers(problem: Problem, change: Any) -> Problem:
     )
 
 
+def spread_over_epochs(c: Constraint, rise: Array | None) -> Constraint:
+    """Return a constraint for each epoch; `rise` (..., k, 2) is the known change of height, m, and its rate, m/s."""
+    if isinstance(c, Polygon):
+        return c
+    if isinstance(c, AnyOf):
+        spread = [tuple(spread_over_epochs(band, rise) for band in member) for member in c.members]
+        return replace(c, members=tuple(spread))  # type: ignore[arg-type]  # bands stay bands
+    # the axis of epochs becomes the last batch axis, unless all problems share the numbers
+    lower, upper = (bound[..., None] if bound.ndim else bound for bound in (c.lower, c.upper))
+    rise_of_height = 0.0 if rise is None or not c.along else rise[..., 0]
+    coefficients = c.coefficients if c.coefficients.ndim == 1 else np.expand_dims(c.coefficients, -2)
+    return replace(c, lower=lower + rise_of_height, upper=upper + rise_of_height, coefficients=coefficients)
+
+
 def _map_z(problem: Problem, change: Any) -> Problem:
     """Return the problem with the measured values of each block replaced by ``change(z)``."""
     return replace(problem, rows=tuple(replace(r, z=change(r.z)) for r in problem.rows))

@@ -4,9 +4,7 @@ A *level* is one bound of one constraint, satisfied with equality. A *face* is a
 together. A *band* is a constraint ``lower <= g(x) <= upper``; its *quantity* is g.
 """
 
-from optloc.linear.constraints.chance import chance as chance
-from optloc.linear.constraints.cones import is_held as is_held
-from optloc.linear.constraints.faces import (
+from optloc.linear.constraints.bound_sets import (
     bounds as bounds,
     conjunction as conjunction,
     exact as exact,
@@ -15,22 +13,8 @@ from optloc.linear.constraints.faces import (
     finite_sides as finite_sides,
     is_conjunctive as is_conjunctive,
 )
-from optloc.linear.constraints.levels import (
-    Face as Face,
-    Level as Level,
-    band_at as band_at,
-    bound_of as bound_of,
-    face_names as face_names,
-    is_corner as is_corner,
-    is_flat as is_flat,
-    is_height as is_height,
-    kind_of as kind_of,
-    levels as levels,
-    on_face as on_face,
-    outwards as outwards,
-    restore as restore,
-    tangent_at as tangent_at,
-)
+from optloc.linear.constraints.chance import chance as chance
+from optloc.linear.constraints.cones import is_held as is_held
 from optloc.linear.constraints.quantities import (
     bands_of as bands_of,
     bounded as bounded,
@@ -56,6 +40,22 @@ from optloc.linear.constraints.regions import (
     polyline as polyline,
     quantity as quantity,
     terrain as terrain,
+)
+from optloc.linear.constraints.single_bounds import (
+    Face as Face,
+    Level as Level,
+    band_at as band_at,
+    bound_of as bound_of,
+    face_names as face_names,
+    is_corner as is_corner,
+    is_flat as is_flat,
+    is_height as is_height,
+    kind_of as kind_of,
+    levels as levels,
+    on_face as on_face,
+    outwards as outwards,
+    restore as restore,
+    tangent_at as tangent_at,
 )
 from optloc.linear.constraints.statements import (
     acceleration as acceleration,

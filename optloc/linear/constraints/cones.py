@@ -14,10 +14,10 @@ import numpy as np
 
 from optloc.base.linalg import factor
 from optloc.base.types import AnyOf, Array, Polygon
-from optloc.linear.constraints.faces import finite_sides
-from optloc.linear.constraints.levels import Face, Level, bound_of, levels, outwards
+from optloc.linear.constraints.bound_sets import finite_sides
 from optloc.linear.constraints.polygons import distances_from_edges, is_reflex
 from optloc.linear.constraints.quantities import is_exact
+from optloc.linear.constraints.single_bounds import Face, Level, bound_of, levels, outwards
 from optloc.linear.constraints.violation import TOLERANCE, member_violation, plan_positions
 from optloc.problem.problem import Problem
 

@@ -10,9 +10,9 @@ from itertools import combinations, product
 import numpy as np
 
 from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon
-from optloc.linear.constraints.levels import Face, Level, binds_position, levels
 from optloc.linear.constraints.polygons import edge_of, is_convex, sense_of
 from optloc.linear.constraints.quantities import decisive_epochs, is_exact
+from optloc.linear.constraints.single_bounds import Face, Level, binds_position, levels
 from optloc.linear.constraints.violation import TOLERANCE
 from optloc.problem.problem import Problem
 
