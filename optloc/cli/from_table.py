@@ -91,7 +91,7 @@ _OPTIONS: dict[str, Any] = {
         _TEXT,
         _option(
             "WHAT",
-            "Content: arrivals, sp, pseudoranges, stations or a kind such as range; by default from the column names.",
+            "Content: arrivals, picks, sp, excess, pseudoranges, stations or a kind; by default from the column names.",
             "--as",
         ),
     ],
@@ -127,8 +127,10 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
     "reference": Annotated[_TEXT, _option("STATION", "Reference station of all differences.", "--reference")],
-    "vp": Annotated[_TEXT, _option("SPEED", "Speed of P waves, such as '6 km/s'.", "--vp")],
-    "vs": Annotated[_TEXT, _option("SPEED", "Speed of S waves, such as '3.5 km/s'.", "--vs")],
+    "vp": Annotated[
+        _TEXT, _option("SPEED", "Speed of P waves, such as '6 km/s', or a table of layers, such as crust.csv.", "--vp")
+    ],
+    "vs": Annotated[_TEXT, _option("SPEED", "Speed of S waves, such as '3.5 km/s'; with layers 'vp/1.73'.", "--vs")],
     "window": Annotated[
         _TEXT, _option("TIME", "Time within which readings belong to one epoch, such as '0.1 s'.", "--window")
     ],
