@@ -106,12 +106,11 @@ def run_fix(
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
-    loaded = replace(read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output), floors=floors)
-    claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
-    loaded = _estimate_noise(loaded, noise)
+    read = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
+    claim_outputs(geojson_path, html, results=(out, read.problem.frame), picture=plot, inputs=[file])
+    loaded = _estimate_noise(replace(read, floors=floors), noise)
     rescaled = _common_level(loaded.problem) if rescale else None
-    if rescaled is not None:
-        loaded = replace(loaded, problem=rescaled.scale(loaded.problem))
+    loaded = loaded if rescaled is None else replace(loaded, problem=rescaled.scale(loaded.problem))
     signals = late_signals(loaded.problem) if late else None
     found = fix_file(loaded, signals.method if signals is not None and signals.share else method, quiet or as_json)
     # The table of results has a row for each epoch and target. Add the late rows only if each fix is one row.

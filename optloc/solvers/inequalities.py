@@ -417,9 +417,13 @@ def _on_alike(
         )
         bands.append(replace(same[0][0], lower=value, upper=value, coefficients=c))
     face = tuple(Level(k, "equal", level.epoch) for k, level in enumerate(sides[numbers[0]]))
-    ends, cost, status = descend(replace(part, constraints=tuple(bands)), start, np.arange(len(own)), face)
+    limited = replace(part, constraints=tuple(bands))
+    ends, cost, status = descend(limited, start, np.arange(len(own)), face)
+    # bent levels need not meet, and a point on one of them only is no minimum on both
+    missed = np.abs(levels(limited, face, ends)[0])
+    on_levels = (missed <= TOLERANCE * (1.0 + np.abs(np.stack([b.lower for b in bands], axis=1)))).all(1)
     # a minimum on a face may break another constraint; the face of both constraints is tried too
-    inside = (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
+    inside = on_levels & (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
     code = np.where(inside, status, np.int8(Status.INFEASIBLE))
     refused = np.where(inside | (status != Status.OK), np.inf, cost)
     out, first = [], 0

@@ -375,7 +375,6 @@ def verdict(name, seed, method="auto"):
     if cost > best * (1.0 + 1e-6) + 1e-6:
         wrong.append(f"missed: {cost:.9g} at {x}, {best:.9g} at {where} ({fix.status}, {fix.active[()]})")
     if fix.status == Status.AMBIGUOUS:
-        for other in others_of(fix):
-            if not is_local_minimum(case, other, rng):
-                wrong.append(f"no minimum: alternative {other}")
+        false = [other for other in others_of(fix) if not is_local_minimum(case, other, rng)]
+        wrong += [f"no minimum: alternative {other}" for other in false]
     return "; ".join(wrong), active

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from linear.constraints import courses, judge
-from linear.constraints.shared import PLANE, SIGMA
+from linear.constraints.shared import PLANE, SIGMA, SPACE
 from often import few
 
-from optloc import assemble, constraints, crlb, measured, solve
+from optloc import Motion, assemble, constraints, crlb, measured, solve
 
 CASES = [(name, judge.verdict) for name in judge.ALL] + [(name, courses.verdict) for name in courses.ALL]
 NAMES = [name for name, _ in CASES]
@@ -50,10 +50,14 @@ def deviation():
 
 # Regions with the target k standard deviations inside their bound, which is across the first coordinate.
 REGIONS = {
-    "disc": lambda k: constraints.disc(TARGET - [40.0 - k, 0.0], 40.0),
-    "keep-out disc": lambda k: constraints.keep_out_disc(TARGET + [40.0 + k, 0.0], 40.0),
-    "keep-out polygon": lambda k: constraints.keep_out_polygon(TARGET + [[k, -200.0], [60.0, 0.0], [k, 200.0]]),
-    "polyline": lambda k: constraints.polyline(TARGET + [[-25.0 + k, -200.0], [-25.0 + k, 0.0], [-90.0, 200.0]], 25.0),
+    "disc": lambda k: constraints.disc(TARGET - np.array([40.0 - k, 0.0]), 40.0),
+    "keep-out disc": lambda k: constraints.keep_out_disc(TARGET + np.array([40.0 + k, 0.0]), 40.0),
+    "keep-out polygon": lambda k: constraints.keep_out_polygon(
+        TARGET + np.array([[k, -200.0], [60.0, 0.0], [k, 200.0]])
+    ),
+    "polyline": lambda k: constraints.polyline(
+        TARGET + np.array([[-25.0 + k, -200.0], [-25.0 + k, 0.0], [-90.0, 200.0]]), 25.0
+    ),
 }
 
 
@@ -69,9 +73,9 @@ def test_the_region_at_a_bent_bound_holds_the_target(name, n):
 
 
 EQUALITIES = {
-    "circle": constraints.annulus(TARGET - [30.0, 40.0], 50.0, 50.0),
+    "circle": constraints.annulus(TARGET - np.array([30.0, 40.0]), 50.0, 50.0),
     "far disc": constraints.disc(TARGET, 200.0),
-    "far road": constraints.polyline(TARGET + [[-300.0, -300.0], [-90.0, 0.0], [300.0, 300.0]], 200.0),
+    "far road": constraints.polyline(TARGET + np.array([[-300.0, -300.0], [-90.0, 0.0], [300.0, 300.0]]), 200.0),
 }
 
 
@@ -84,13 +88,51 @@ def test_covariances_are_those_of_draws(name, n, within):
     assert np.trace(found) == pytest.approx(np.trace(stated), rel=within)
 
 
+def tangent_bound(information, normal):
+    """Return the covariance whose directions are at right angles to a normal."""
+    along = np.linalg.svd(normal[None])[2][1:].T
+    return along @ np.linalg.inv(along.T @ information @ along) @ along.T
+
+
+def information_of(stations, place):
+    line = (place - stations) / np.linalg.norm(place - stations, axis=1, keepdims=True)
+    return line.T @ line / SIGMA**2
+
+
+def bound_of(problem, truth):
+    return np.asarray(crlb(problem, truth)).reshape(len(truth), len(truth))
+
+
 def test_the_bound_on_a_circle_is_that_of_its_tangent():
-    z = np.linalg.norm(PLANE - TARGET, axis=1)
-    rows = measured("range", z, a=range(4), sigma=SIGMA)
-    bound = crlb(assemble(PLANE, rows, constraints=EQUALITIES["circle"]), TARGET)
-    along = np.array([-0.8, 0.6])
-    line = (TARGET - PLANE) / np.linalg.norm(TARGET - PLANE, axis=1, keepdims=True)
-    expected = SIGMA**2 / (along @ line.T @ line @ along) * np.outer(along, along)
-    np.testing.assert_allclose(
-        np.asarray(getattr(bound, "covariance", bound)).reshape(2, 2), expected, rtol=1e-9, atol=1e-9
-    )
+    rows = measured("range", np.linalg.norm(PLANE - TARGET, axis=1), a=range(4), sigma=SIGMA)
+    found = bound_of(assemble(PLANE, rows, constraints=EQUALITIES["circle"]), TARGET)
+    expected = tangent_bound(information_of(PLANE, TARGET), np.array([0.6, 0.8]))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_bound_on_a_ground_is_that_of_its_tangent():
+    x = np.linspace(0.0, 1000.0, 9)
+    (ground,) = constraints.terrain(x, x, 40.0 * np.sin(x[:, None] / 200.0) + 0.1 * x, exactly=3.0)
+    height, slope_x, slope_y = ground.table.at(*TARGET)
+    truth = np.append(TARGET, height + 3.0)
+    rows = measured("range", np.linalg.norm(SPACE - truth, axis=1), a=range(4), sigma=SIGMA)
+    found = bound_of(assemble(SPACE, rows, constraints=(ground,)), truth)
+    expected = tangent_bound(information_of(SPACE, truth), np.array([-slope_x, -slope_y, 1.0]))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_the_bound_of_two_targets_at_a_known_distance_is_that_of_its_tangent():
+    truth = np.concatenate([TARGET, TARGET + np.array([30.0, 40.0])])
+    z = np.concatenate([np.linalg.norm(PLANE - place, axis=1) for place in truth.reshape(2, 2)])
+    rows = measured("range", z, a=[0, 1, 2, 3] * 2, target=[0] * 4 + [1] * 4, sigma=SIGMA)
+    limits = constraints.separation(0, 1, 50.0, 50.0)
+    found = bound_of(assemble(PLANE, rows, motions=(Motion(), Motion()), constraints=limits), truth)
+    free = np.zeros((4, 4))
+    free[:2, :2], free[2:, 2:] = (information_of(PLANE, place) for place in truth.reshape(2, 2))
+    np.testing.assert_allclose(found, tangent_bound(free, np.array([-0.6, -0.8, 0.6, 0.8])), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [13, 29])
+def test_bounds_that_do_not_meet_give_no_alternatives(seed):
+    assert judge.verdict("keep_out_and_box", seed)[0] == ""
