@@ -393,20 +393,6 @@ def declination_text(chunks: Sequence[RowChunk]) -> str:
     return f"; magnetic declination {low if low == high else f'{low} to {high}'} deg, east positive"
 
 
-def with_baseline(chunk: RowChunk, baseline: Array) -> RowChunk:
-    """Return a chunk of excess paths with the distance (m,) of its stations added."""
-    return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)
-
-
-def with_station_distance(chunk: RowChunk, epoch: Array, stations: Stations) -> RowChunk:
-    """Return a chunk with excess paths converted to path sums: the distance of the stations is added."""
-    if not chunk.excess:
-        return chunk
-    place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
-    rows = np.arange(len(epoch))
-    return with_baseline(chunk, np.linalg.norm(place[rows, chunk.a] - place[rows, chunk.b], axis=-1))
-
-
 # Noise of a table.
 
 

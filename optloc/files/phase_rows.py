@@ -76,7 +76,7 @@ def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list
     is_s = is_s_of(chunk.table)[chunk.row]
     event = np.unique(np.column_stack([epoch, target]), axis=0, return_inverse=True)[1].reshape(-1)
     try:
-        sets, _ = phase_rows(chunk.a[present], is_s[present], event[present], chunk.vp_vs)
+        sets, unused = phase_rows(chunk.a[present], is_s[present], event[present], chunk.vp_vs)
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(source, "key 'vp_vs'"), "give a ratio such as 1.73") from None
     made, events, variance = [], event[present], chunk.sigma[present] ** 2
@@ -87,13 +87,35 @@ def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list
             name: None if (values := getattr(chunk, name)) is None else values[first]
             for name in ("row", "weight", "slope", "baseline", "label", "time", "written", "target")
         }
-        combination = Combination(rows, events, variance)
+        combination = Combination(rows, events, variance, chunk.a[present[unused]])
         part = replace(
             chunk, kind=rows.kind, a=rows.a, b=rows.b, sigma=None, vp_vs=None, combination=combination,
             **columns,
         )  # fmt: skip
         made.append((part, first))
     return made
+
+
+def unused_picks(chunks: Sequence[RowChunk], names: Sequence[str]) -> tuple[str, ...]:
+    """Return a sentence for each section with S picks that no row contains; `names` are the names of the stations."""
+    by_section = {id(one.combination.event): one.combination.unused for one in chunks if one.combination is not None}
+    return tuple(
+        f"{len(unused)} S pick{'s' if len(unused) > 1 else ''} of {_list_names(unused, names)} not used: no station of "
+        "the event has both P and S; add a P pick of one of these stations"
+        for unused in by_section.values()
+        if len(unused)
+    )
+
+
+# Most stations that a sentence names.
+_NAMED = 3
+
+
+def _list_names(stations: Array, names: Sequence[str]) -> str:
+    """Return the names of stations (u,) as text, three at most, with the verb of the sentence."""
+    found = [str(names[i]) for i in dict.fromkeys(stations.tolist())]
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return f"{', '.join(found[:_NAMED])}{more} {'is' if len(stations) == 1 else 'are'}"
 
 
 def combined_noise(chunks: Sequence[RowChunk], numbers: Sequence[Array]) -> list[Block]:

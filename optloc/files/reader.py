@@ -27,6 +27,7 @@ from optloc.files.constraint_reader import (
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
+from optloc.files.excess_paths import with_station_distance
 from optloc.files.measurements import (
     ESTIMATE,
     RowChunk,
@@ -35,9 +36,8 @@ from optloc.files.measurements import (
     declination_text,
     square,
     with_declination,
-    with_station_distance,
 )
-from optloc.files.phase_rows import combined_noise, split_phases
+from optloc.files.phase_rows import combined_noise, split_phases, unused_picks
 from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
@@ -153,7 +153,7 @@ class Draft:
     def plausible(self, surface: str) -> Loaded:
         """Return the problem with warnings on suspicious values; raise InvalidProblem for impossible values."""
         found = warnings_of(self.loaded.problem, self.chunks, self.numbers, surface, self.loaded.source)
-        return replace(self.loaded, warnings=found)
+        return replace(self.loaded, warnings=found + unused_picks(self.chunks, self.loaded.problem.stations.names))
 
 
 def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:

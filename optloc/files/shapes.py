@@ -21,6 +21,7 @@ from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_se
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.picks import differences, read_picks
+from optloc.files.repeated_readings import without_repeats
 from optloc.files.roles import ColumnPlaces, Roles, placed
 from optloc.files.settings import Units
 from optloc.files.table import Table
@@ -36,7 +37,6 @@ from optloc.files.table_import import (
     stated_sigma,
     unit_for,
     without_gaps,
-    without_repeats,
 )
 from optloc.files.words import equal_rows, numbered
 from optloc.models import BEARING

@@ -71,11 +71,14 @@ class Combination:
         Number of the event of each arrival of the section.
     variance : array (n,)
         Variance of each arrival, square metres.
+    unused : int array (u,)
+        Stations of the S arrivals of the section that no row contains.
     """
 
     rows: PhaseRows
     event: Array
     variance: Array
+    unused: Array
 
 
 class _CombinedRow(NamedTuple):

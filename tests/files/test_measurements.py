@@ -5,7 +5,7 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.files.measurements import chunks_of, square, with_baseline
+from optloc.files.measurements import chunks_of, square
 from optloc.files.schema import MeasurementsTable
 from optloc.files.table import of_rows
 
@@ -34,13 +34,6 @@ def test_a_column_of_kinds_makes_one_chunk_of_each_in_order_of_appearance():
         ("range", [0, 2], [1.0, 3.0]),
         ("height", [1], [2.0]),
     ]
-
-
-def test_the_distance_of_the_stations_is_added_to_present_rows_only():
-    rows = [{"a": "A", "b": "B", "z": 5.0, "sigma": 1.0}, {"a": "A", "b": "C", "z": 5.0, "sigma": 1.0, "weight": 0.0}]
-    (one,) = chunks([row | {"weight": row.get("weight", 1.0)} for row in rows], kind="range_sum", excess=True)
-    assert with_baseline(one, np.array([10.0, 20.0])).z.tolist()[0] == 15.0
-    assert with_baseline(one, np.array([10.0, 20.0])).z[1] == one.z[1]
 
 
 def test_noise_is_given_once():

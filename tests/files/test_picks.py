@@ -96,6 +96,19 @@ def test_p_alone_both_and_s_alone_have_one_origin_time(tmp_path):
     assert np.linalg.norm(fix.position - place(*FOCUS)) < 60.0
 
 
+def test_an_s_pick_that_no_row_contains_is_named(vinti):
+    lines = vinti.read_text().splitlines()
+    vinti.write_text("\n".join(line for line in lines if ",S," not in line or "RONE" in line or "IMI" in line) + "\n")
+    hints = ColumnHints(vinti.parent / "net.csv", "0.2 s", vp="6.0 km/s", vs="3.57 km/s")
+    assert not interpret_table(vinti, hints).read().warnings
+    # without their P picks, no station has both
+    lines = vinti.read_text().splitlines()
+    vinti.write_text("\n".join(line for line in lines if not line.startswith(("RONE,P", "IMI,P"))) + "\n")
+    (sentence,) = interpret_table(vinti, hints).read().warnings
+    assert "1 S pick of RONE is not used" in sentence
+    assert len(sentence) <= 200
+
+
 def test_other_phases_are_left_out_with_a_note(tmp_path):
     path = written(tmp_path)
     path.write_text(path.read_text() + "AQU,Lg,2024-04-06T01:32:50Z\nAQU,SKS,2024-04-06T01:32:52Z\n")
