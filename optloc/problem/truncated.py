@@ -312,7 +312,7 @@ class Truncated:
         """
         if self.region is not None:
             number, _, end = self._parts(step, np.full(len(step), _FAR))
-            # a direction inwards may leave the region at its very begin, by rounding: the longest part then counts
+            # a direction inwards may leave the region at its beginning, by rounding: the longest part then counts
             out = np.zeros(len(step))
             np.maximum.at(out, number, end)
             return np.where(out < _FAR, out, np.inf)

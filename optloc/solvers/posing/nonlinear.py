@@ -354,7 +354,7 @@ class PosedProgram(Posed):
         try:
             program = Program.of(self._program, self._statement, choice=choice, settings=settings)
         except RuntimeError:  # CasADi raises no other type
-            given = ", ".join(settings)
+            given = ", ".join(one for one in settings if one not in {**_SETTINGS, **_FROM_SOLUTION}) or "of optloc"
             raise InvalidProblem(
                 f"{name} does not accept the settings {given}", "settings", "check their names"
             ) from None

@@ -53,6 +53,10 @@ class Posed(ABC):
         self.relations: dict[str, Relation] = {}
         self.own_objective = False
 
+    def __repr__(self) -> str:
+        """Return the name of the formulation, and the changes, as text."""
+        return f"<posed problem {self.formulation!r}{self._changes()}>"
+
     # Parts in SI units.
 
     @abstractmethod

@@ -36,3 +36,11 @@ def test_refinement_is_a_choice(formulation):
     assert refined.posed.refined
     assert refined.status == solve(problem).status
     assert refined[()].posed is refined.posed or refined.shape == ()
+
+
+@pytest.mark.parametrize("formulation", ["squared_range_conic: hull", "nls"])
+def test_its_text_names_the_formulation_and_the_changes(formulation):
+    posed = pose(ranged(2), formulation)
+    assert repr(posed) == f"<posed problem '{formulation}'>"
+    posed.add(posed.position[0] <= 1e9, name="fence")
+    assert repr(posed) == f"<posed problem '{formulation}' with constraint \"fence\">"
