@@ -81,7 +81,7 @@ def test_version_help_and_lists():
     assert "Examples" in run("fix", "--help").stdout
     assert "tdoa" in run("list", "kinds").stdout
     assert {row["kind"] for row in json.loads(run("list", "kinds", "--json").stdout)} >= {"tdoa", "height"}
-    assert "kinds, formulations, solvers" in run("list", "books", code=2).stderr
+    assert "kinds, constraints, formulations, solvers" in run("list", "books", code=2).stderr
 
 
 def test_schema_is_json():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from files.test_constraint_files import ranges, ranging, run
-from linear.constraints.test_faces import ENU, PLANE, SPACE, above, drawn, moving
+from linear.test_constraints import ENU, PLANE, SPACE, above, drawn, moving
 from often import few
 from scipy.optimize import minimize
 from verdicts import alone

@@ -484,8 +484,8 @@ def list_(
         typer.Argument(
             metavar="WHAT",
             autocompletion=_lists,
-            help="kinds, formulations, solvers, methods, losses, trackers, motions, baselines, formats, executors, "
-            "studies, papers, datasets, pictures, demos or starters.",
+            help="kinds, constraints, formulations, solvers, methods, losses, trackers, motions, baselines, formats, "
+            "executors, studies, papers, datasets, pictures, demos or starters.",
         ),
     ],
     as_json: Json = False,

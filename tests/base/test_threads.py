@@ -18,7 +18,7 @@ from optloc.base.threads import map_in_order, map_on_threads, thread_count
 from optloc.engine import plan
 from optloc.kernels import tables, trace
 from optloc.linear import evaluate
-from optloc.solvers import ipopt
+from optloc.solvers import scaled_program
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -188,7 +188,7 @@ def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves:
     count = len(problems)
     tasks = [(i % count, methods[(i + i // count) % len(methods)]) for i in range(solves)]
     alone = {task: solve(problems[task[0]], task[1]) for task in set(tasks)}
-    for cache in (evaluate._LINKS, tables._KEPT, trace._TRACED, plan._KEPT, ipopt._PROGRAMS):
+    for cache in (evaluate._LINKS, tables._KEPT, trace._TRACED, plan._KEPT, scaled_program._PROGRAMS):
         cache.clear()
 
     def again(task: tuple[int, str]) -> None:

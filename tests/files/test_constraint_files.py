@@ -144,7 +144,7 @@ BAD = {
     "several positions": ('kind = "above-ground"\n[target]\nrows = [{ x = 0 }, { x = 1 }]', ["several positions"]),
 }  # fmt: skip
 IN_PLANE = {
-    "height without the Earth": ('kind = "height"\nmin = 1', ["height", "geodetic frame"]),
+    "height in a plane": ('kind = "height"\nmin = 1', ["stations in the plane have no height"]),
     "horizon without the Earth": ('kind = "visible"', ["geodetic frame"]),
     "degrees without the Earth": ('kind = "polygon"\ncorners_deg = [[0, 0], [9, 0], [9, 9]]', ["need an enu frame"]),
 }

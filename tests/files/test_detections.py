@@ -10,6 +10,7 @@ import optloc
 from optloc import InvalidProblem
 from optloc.files.convert import convert
 from optloc.files.csv_formats import read_table
+from optloc.files.wave_speed import WaveOptions
 
 SOUND = 343.0
 RECEIVERS = {
@@ -47,9 +48,8 @@ def test_events_give_their_sources(form, tmp_path):
     table = read_table(tmp_path / "events.csv")
     assert table.count == 8
     assert table.labels("station").tolist()[:2] == ["a_652_1.wav", "a_652_2.wav"]
-    made = convert(tmp_path / "events.csv", tmp_path / "events.toml", sigma="0.1 ms")
-    text = made.written[0].read_text().replace("format = 2", f"format = 2\npropagation_speed = {SOUND}")
-    made.written[0].write_text(text)
+    wave = WaveOptions(speed=f"{SOUND} m/s")
+    made = convert(tmp_path / "events.csv", tmp_path / "events.toml", sigma="0.1 ms", wave=wave)
     fixes = optloc.solve(optloc.load(made.written[0]))
     assert fixes.position == pytest.approx(np.array(SOURCES), abs=0.05)
 

@@ -285,7 +285,6 @@ def test_files_hold_heights_along_courses(loaded):
         ('kind = "height"\nmin = 3.0\nwithin = "1 m"\n', "constant_velocity", "'within' needs"),
         ('kind = "height"\nexactly = 3.0\nwithin = "-1 m"\n', "constant_velocity", "negative width"),
         ('kind = "height"\nmin = 0.0\nalong = true\n', "constant_acceleration", "constant acceleration"),
-        ('kind = "speed"\nmax = 3.0\nalong = true\n', "constant_velocity", "no key 'along'"),
     ],
 )
 def test_files_say_what_heights_cannot_be(loaded, demand, motion, message):

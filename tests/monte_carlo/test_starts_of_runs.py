@@ -9,7 +9,8 @@ from runs import drawn, run, truth
 
 import optloc
 from optloc.solvers.starts.block_averages import average_blocks
-from optloc.solvers.starts.registration import closed_form, relax_run
+from optloc.solvers.starts.registration import closed_form
+from optloc.solvers.starts.registration_windows import relax_run
 
 SEED, TRIALS = 41, 12
 CASES = {

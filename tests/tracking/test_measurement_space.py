@@ -298,8 +298,11 @@ MOVING = assemble(
         (lambda: simplified(draw(5, 1, 1), mean=0), "mean is 0"),
         (lambda: simplified(draw(5, 1, 1), floor=1.5), "gain floor"),
         (lambda: lines(MOVING), "stations move"),
-        (lambda: lines(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
-        (lambda: simplified(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
+        (lambda: lines(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "fences or priors"),
+        (
+            lambda: simplified(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))),
+            "constraints, fences or priors",
+        ),
         (lambda: lines(draw(5, 1, 1), 3), "order of the polynomial is 3"),
         (lambda: lines(draw(5, 1, 1), 1, window=1), "too few epochs"),
         (lambda: lines(draw(1, 1, 1), 1), "too few epochs"),
