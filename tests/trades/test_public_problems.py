@@ -79,7 +79,7 @@ def test_ranges_of_a_uwb_module(tmp_path, monkeypatch):
     """UWB: github.com/lemmingapex/trilateration, issue 15 and README: four positions and ranges of a DWM1000 tag.
 
     Four ranges of rounded metres contradict each other by half a metre. The published answer (-0.6, -11.8) minimises
-    errors of squares. Least squares of the ranges gives (-0.37, -12.23), own computation by scipy from 100 starts.
+    errors of squares. Least squares of the ranges gives (-0.370, -12.228), by SciPy from 100 starts.
     """
     monkeypatch.chdir(tmp_path)
     rows = [("1", 5.0, -6.0), ("2", 13.0, -15.0), ("3", 21.0, -3.0), ("4", 12.4, -21.2)]
@@ -224,7 +224,7 @@ def test_s_minus_p_times_of_an_earthquake(tmp_path, monkeypatch):
     """Earthquakes: Saint Louis University, eas.slu.edu/Outreach/eqexercise.html: S minus P of 10, 25 and 38 s.
 
     The page multiplies by 8 km/s, which are P waves of 5.84 km/s and S waves of 3.37 km/s by its ratio of 1.37. The
-    stations are in the FDSN catalogue, here to a kilometre. A focus at the surface near Jonesboro, Arkansas, fits the
+    positions of the stations are approximate, to a kilometre or so. A focus at the surface near Jonesboro, Arkansas, fits the
     whole seconds.
     """
     monkeypatch.chdir(tmp_path)
