@@ -41,7 +41,7 @@ class ConicSolver:
     summary : str
         Method and source, for listings.
     read : callable, optional
-        Returns the numbers of the solver's own solution object; without it, numbers are those of cvxpy.
+        Returns the numbers of the solver's own solution object; without it, cvxpy's numbers are used.
     quiet : Mapping[str, Any]
         Settings that suppress output.
     takes_start : bool

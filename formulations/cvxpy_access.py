@@ -199,7 +199,7 @@ def cvxopt_solution(found: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-# What the solvers of cvxpy support.
+# Cones and objectives that the solvers of cvxpy support.
 
 
 def cones_of_solvers() -> dict[str, frozenset[str]]:
@@ -305,7 +305,7 @@ class ConeProgram:
     slots : dict
         For each parameter name, its first entry in the parameter vector, and its shape.
     length : int
-        Length of the parameter vector without the one at its end.
+        Length of the parameter vector without the constant 1 at its end.
     linear : scipy.sparse matrix
         Map from the parameter vector to q, followed by d.
     constraints : AffineMap
@@ -379,7 +379,7 @@ def dual_values(problem: Any) -> tuple[Array, ...]:
     Returns
     -------
     tuple of Array
-        The dual values in cvxpy's signs; an empty array where there is none.
+        The dual values in cvxpy's signs; an empty array for a constraint without dual values.
     """
     return tuple(_flat(constraint.dual_value) for constraint in problem.constraints)
 

@@ -69,7 +69,7 @@ def lifted_problem(count: int, dim: int, change: Array | None = None) -> Any:
     count, dim : int
         M stations in d dimensions.
     change : Array, shape (1 + d + M, 1 + d + M), optional
-        Other unknowns u, whose first is 1, with ``(1, x, r) = change u``; by default u is (1, x, r).
+        Matrix for other unknowns u: ``(1, x, r) = change u``, where u[0] = 1. By default u is (1, x, r).
 
     Returns
     -------

@@ -25,7 +25,7 @@ def status_of(stats: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        The status. alpaqa has no status of its own, so the status is CasADi's word for all solvers.
+        The status of the solver. alpaqa returns none, so CasADi's `unified_return_status` replaces it.
 
     Raises
     ------
@@ -52,8 +52,8 @@ def nonlinear_report(name: str, stats: Mapping[str, Any], status: str, *, succes
     Returns
     -------
     SolverReport
-        The residuals are those of the last iteration of IPOPT (of its scaled problem) and Uno; NaN for other solvers.
-        There is no gap.
+        For IPOPT and Uno, the residuals after the last iteration; IPOPT's residuals belong to its scaled problem. For
+        other solvers, the residuals are NaN. There is no gap.
     """
     log = stats.get("iterations")
     rows = log if isinstance(log, Mapping) else {}

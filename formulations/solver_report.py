@@ -31,7 +31,7 @@ class SolverReport:
     seconds : float
         Time that the solver reports, without cvxpy or CasADi; NaN if it reports none.
     message : str
-        Message of the solver, for instance the reason of a failure; empty if there is none.
+        Message of the solver, for instance the reason of a failure; empty if the solver returns no message.
     outcome : str
         ``"solved"`` (full tolerances), ``"inaccurate"`` (reduced tolerances), ``"infeasible"``, ``"unbounded"``, or
         ``"failed"``.

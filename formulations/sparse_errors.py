@@ -241,7 +241,7 @@ def sparse_program(
 ) -> SparseProgram | None:
     """Return the data of a programme; None if a number is not finite or the rows leave a direction undetermined.
 
-    The arguments and the error are those of `sparse_fit`.
+    `sparse_fit` has the same arguments and raises the same error.
     """
     m, n = B.shape
     member = np.arange(m) if groups is None else np.asarray(groups)

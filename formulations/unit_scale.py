@@ -1,13 +1,13 @@
-r"""Origin and unit of length for conic programs: the one place where coordinates are centred and scaled.
+r"""Origin and unit of length for conic programs: this module centres and scales all coordinates.
 
 A conic solver has relative tolerances, and the lift of a position contains squares. In metres, the cost of a fix would
-be rounding beside the squares of its coordinates, and a bound from the dual would have no meaning. Both changes of
-variables are exact:
+be smaller than the rounding error of its squared coordinates. A bound from the dual would have no meaning. Both changes
+of variables are exact:
 
 - *points*: :math:`x = c + u x'`;
 - *squared-range rows* :math:`B y = g` with `y` on a quadric (:mod:`formulations.squared_range`): on the cone,
   :math:`(x, r) = u (x', r')`, because its apex is fixed; on the paraboloid, :math:`x = c + u x'` and :math:`w = |c|^2 +
-  2 u c^\top x' + u^2 w'`, so that again :math:`w' = |x'|^2`.
+  2 u c^\top x' + u^2 w'`. Then again :math:`w' = |x'|^2`.
 
 The unit is a power of two, so that multiplications by it have no rounding error. Source: N. J. Higham, "Accuracy and
 stability of numerical algorithms", 2nd ed. (2002), section 7.3 (scaling by powers of the base).

@@ -83,7 +83,7 @@ _BEHIND = {"plane", "distance", "segment", "turn_rate", "least speed", "least se
 
 
 def kind_names() -> list[str]:
-    """Return the names of all kinds of constraints: those of optloc, then the quantities of other packages."""
+    """Return the names of all kinds of constraints: the kinds of optloc, then the quantities of other packages."""
     return [*CONSTRAINT_KINDS, *sorted(set(SURFACES) - set(CONSTRAINT_KINDS) - _BEHIND)]
 
 

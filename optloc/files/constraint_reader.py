@@ -139,7 +139,7 @@ def divided(limits: Sequence[Limit]) -> dict[str, Any]:
 
 
 def _made(kind: ConstraintKind, values: ConstraintValues) -> Any:
-    """Return what a kind makes of its values; an error gets the place of the table."""
+    """Return the constraints that a kind makes of its values; an error gets the place of the table."""
     try:
         return kind.make(values)
     except InvalidProblem as error:

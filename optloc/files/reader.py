@@ -254,7 +254,7 @@ def assemble(
     known : mapping of str to Table, optional
         Positions of known targets by name; None is the key of the single target.
     limits : mapping of str to constraints, optional
-        The constraints by their place for messages, see `limits_of`; by default those of `file`.
+        The constraints by their place for messages, see `limits_of`; by default the constraints of `file`.
     more : mapping of str to ConstraintTable, optional
         As in `read`.
     """

@@ -159,16 +159,16 @@ _STEP = 1e-5
 
 
 def is_bent(problem: Problem, face: Face) -> bool:
-    """Return whether a level of a face has a curvature that matters; that of the Earth does not."""
+    """Return whether a level of a face has a relevant curvature; the curvature of the Earth is negligible."""
     return any(kind_of(problem, level) not in ("plane", "height") for level in face)
 
 
 def bend_along(problem: Problem, face: Face, equations: Normal, along: Array, x: Array) -> Array:
     """Return the curvature (M, n, n) that bent equalities add to the cost along their tangent space.
 
-    On a surface g = 0 the cost has the second derivative of the function of Lagrange: that of the cost plus the
-    multiplier times that of g. Steps with it converge in a few iterations. Where the sum is not positive, the result is
-    zero, as in the method of Gauss and Newton.
+    On a surface g = 0 the cost has the second derivative of the function of Lagrange. It is the second derivative of
+    the cost plus the multiplier times the second derivative of g. Steps with it converge in a few iterations. Where the
+    sum is not positive, the result is zero, as in the method of Gauss and Newton.
 
     Parameters
     ----------

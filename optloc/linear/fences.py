@@ -31,9 +31,9 @@ from optloc.problem.chart import Skew
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
-# Coefficients of the Chebyshev series P(2 t - 1) in ``erfc(z) = t exp(P - z^2)`` with ``t = 2 / (2 + z)``, z >= 0. The
-# form is from W. H. Press et al., "Numerical Recipes" (3rd ed., 2007), section 6.2.2. The numbers are projections of
-# the exact function, computed with 50 digits; the next coefficient is below 1e-16.
+# Coefficients of the Chebyshev series P(2 t - 1). For z >= 0, ``erfc(z) = t exp(P - z^2)`` with ``t = 2 / (2 + z)``.
+# The form is from W. H. Press et al., "Numerical Recipes" (3rd ed., 2007), section 6.2.2. The numbers are projections
+# of the exact function, computed with 50 digits; the next coefficient is below 1e-16.
 _CHEBYSHEV = (
     -0.6513268598908547,
     0.64196979235649021,
@@ -121,7 +121,7 @@ def cost_of_margin(u: Any) -> Any:
     The relative error is below 1e-12 for margins from -1e150 to 37; beyond 38 the result is zero.
     """
     choose, xp = _choose(u), namespace(u)
-    # Both branches are evaluated for all margins, and derivatives too: so each has a harmless argument of its own.
+    # Both branches are evaluated for all margins, and derivatives too. So each branch has its own harmless argument.
     inside, outside = choose(u >= 0.0, u, 0.0 * u), choose(u >= 0.0, 0.0 * u, -u)
     t, series = _series(_ROOT_HALF * inside)
     log1p = _log1p if xp.__name__ == "casadi" else xp.log1p

@@ -1,8 +1,9 @@
 """Truncated normal distributions of fixes at or near bounds, and the shape of the cost inside the bounds.
 
 Inequality constraints give h bounds. Arrays have N fixes of d coordinates, and n shared unknowns. The slack is the
-distance of a fix from a bound. Near a fix, the bound of a height is replaced by its tangent plane. Circles, roads, the
-ground and other bent bounds, unions and polygons to keep out of are not: a function tells the admitted points.
+distance of a fix from a bound. Near a fix, the bound of a height is replaced by its tangent plane. Other bent bounds
+(circles, roads, the ground), unions, and polygons to keep out of are not replaced. For them, a function tests whether
+points are admitted.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def law_of(problem: Problem, x: Array, covariance: Array, shift: Array) -> Law |
 
 
 def _needs_region(constraint: Constraint) -> bool:
-    """Return whether only a function tells the points that an inequality admits: no plane replaces its bound."""
+    """Return whether an inequality needs a function that tests points, because no plane replaces its bound."""
     if isinstance(constraint, Polygon):
         return constraint.outside
     return not isinstance(constraint, Band) or constraint.kind not in _PLANAR
@@ -145,7 +146,7 @@ class AdmittedPoints:
 
 
 def _regions(problem: Problem, x: Array, spread: Array, part: slice) -> Array | None:
-    """Return functions (N,) that tell the admitted points of fixes near bounds without planes, and None for others.
+    """Return functions (N,) that test points, for fixes near bounds without planes, and None for other fixes.
 
     The result is None if no fix has such a function. `x` (N, size) are the fixes, `spread` (N, d, d) the covariances of
     their positions, and `part` is the slice of the position.
@@ -297,7 +298,7 @@ _STEPS, _SHORT = {1: 2, 2: 8, 3: 20}, 0.3
 def _steps_within(law: Truncated, factor: Array, middle: Array) -> list[tuple[Array, float]]:
     """Return steps (d,) from a fix to admitted points, m, and the increases of the quadratic model there.
 
-    `factor` and `middle` are those of `_inward_steps`.
+    `factor` and `middle` are as in `_inward_steps`.
     """
     rank = factor.shape[1]
     if rank == 0:

@@ -271,4 +271,4 @@ _OWN: dict[str, Surface] = {
 
 
 SURFACES: Registry[Surface] = Registry("optloc.constraints", lambda value: isinstance(value, Surface), _OWN)
-"""Quantities by name: those of optloc and of installed packages."""
+"""Quantities by name: the quantities of optloc and of installed packages."""

@@ -22,7 +22,8 @@ _DEGREE = 3
 class Terrain:
     """Heights of the ground at the points of a grid, with a bicubic spline between them.
 
-    Outside the grid, the height is that of the nearest point on its edge. Two grids are equal if their numbers are.
+    Outside the grid, the height is the height of the nearest point on its edge. Two grids are equal if their
+    numbers are.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ class Terrain:
         Raises
         ------
         TypeError
-            For operands that are none of these, for instance of a recorder of kernels.
+            For other operands, for instance of a recorder of kernels.
         """
         xp = namespace(x.value if isinstance(x, Jet) else x)
         if getattr(xp, "__name__", "") == "casadi":

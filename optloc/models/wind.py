@@ -68,8 +68,8 @@ class Wind:
     def path(self, t: Point, a: Point) -> Any:
         """Return the travel time from target to station, multiplied by `speed`, in metres.
 
-        The wavefront is a sphere of radius c T whose centre drifts by w T. With r from target to station and m = w / c,
-        the equation ``|r - m c T| = c T`` has one positive solution c T.
+        The wavefront is a sphere of radius c T whose centre drifts by w T. Let r point from target to station,
+        and let m = w / c. Then the equation ``|r - m c T| = c T`` has one positive solution c T.
         """
         along, root, rest, _, _ = self._terms(t, a)
         return (root - along) / rest

@@ -210,7 +210,7 @@ def _check_extras(problem: Problem, surface: Surface, band: Band, where: str) ->
         raise InvalidProblem(what, where, "give it with other=" if surface.other else "leave it out")
     if band.other is not None:
         if not 0 <= band.other < count or band.other == band.target:
-            advice = f"use another one of 0 to {count - 1}" if count > 1 else "this problem has one target"
+            advice = f"use another number from 0 to {count - 1}" if count > 1 else "this problem has one target"
             raise InvalidProblem(f"the second target {band.other} does not fit", where, advice)
         if problem.motions[band.other].known is not None:
             raise InvalidProblem("the motion of the second target is known", where, "use a keep-out ball instead")

@@ -26,7 +26,7 @@ class PosedAnswer:
     backend : formulations.solver_report.SolverReport
         Status, residuals, relative gap, iterations and time, as the back end reports them.
     value : float
-        Objective at the solution: chi-square, unless the objective is your own or the formulation has another one.
+        Objective at the solution: chi-square, unless you or the formulation replace it.
     bound : float
         Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound.
     rank_ratio : float

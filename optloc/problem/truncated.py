@@ -3,8 +3,8 @@
 Without bounds the distribution is ``N(x + shift, covariance)``. It is truncated to the admitted points. The fix x is
 the admitted point of highest density. The distribution is integrated along rays from the fix, each up to the first
 bound. Regions and intervals have the highest density, because an interval with equal tails never contains a target on
-the bound. Where the admitted points are no intersection of half-spaces, a function tells them from the others. A ray
-can then have several admitted parts, each of which counts as a ray of its own.
+the bound. Where the admitted points are no intersection of half-spaces, a function tests the points. A ray can then
+have several admitted parts, and each part counts as a separate ray.
 
 Letters: h bounds, d coordinates, k rays, n nodes on a ray. The squared deviation of a point is its squared distance
 from x + shift, in standard deviations. The excess of a point is its squared deviation minus the squared deviation of

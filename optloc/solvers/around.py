@@ -57,7 +57,7 @@ def _surface(problem: Problem, level: Level) -> object | None:
 
 
 def _around_level(problem: Problem, level: Level, items: Array, first: Array) -> Array:
-    """Return starts (n, q, size) around one level; the arguments are those of `starts_around`."""
+    """Return starts (n, q, size) around one level; the arguments are as in `starts_around`."""
     none = np.zeros((len(items), 0, first.shape[-1]))
     constraint = problem.constraints[level.constraint]
     if isinstance(constraint, Polygon):
@@ -82,8 +82,8 @@ def _around_level(problem: Problem, level: Level, items: Array, first: Array) ->
 def _placed(problem: Problem, level: Level, items: Array, first: Array, clouds: list[Array]) -> Array:
     """Return starts (n, q, size) with the position of the target of a level at the points of each problem.
 
-    `clouds` has the points (q, k) of each problem, k coordinates of the position. The other unknowns are those of the
-    vectors `first` (n, size).
+    `clouds` has the points (q, k) of each problem, k coordinates of the position. The other unknowns are copied
+    from the vectors `first` (n, size).
     """
     band, n = band_at(problem, level), problem.layout.n_shared
     count, width = len(problem.motions), max(map(len, clouds), default=0)
@@ -115,7 +115,7 @@ def _placed(problem: Problem, level: Level, items: Array, first: Array, clouds: 
 def _lowest(problem: Problem, shared: Array) -> Array:
     """Return the shared unknowns (k, n), at most `_KEPT`, at which the cost is least among their neighbours.
 
-    `shared` (q, n) are those of one problem, NaN for none.
+    `shared` (q, n) are the candidates of one problem, with NaN for missing candidates.
     """
     from scipy.spatial import cKDTree
 

@@ -1,6 +1,6 @@
 """The stage "nlp": the maximum-likelihood problem as a nonlinear program for IPOPT, one problem at a time.
 
-It checks the refinement by an independent solver. The programs are those of `optloc.solvers.scaled_program`.
+It checks the refinement by an independent solver. Module `optloc.solvers.scaled_program` builds the programs.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
     return replace(settled, refined=False)  # not refined, so that a following "lsr" runs
 
 
-# Most starts of programs on one face of the constraints: those of least cost after projection onto it.
+# Most starts of programs on one face of the constraints: the starts of least cost after projection onto it.
 _STARTS = 6
 
 

@@ -1,6 +1,6 @@
 """The stage "sparse": starts and suspected rows from a convex program that allows gross errors in a few rows.
 
-Letters: N problems, m rows, d coordinates. The programs are those of `optloc.solvers.starts.sparse_rows`.
+Letters: N problems, m rows, d coordinates. Module `optloc.solvers.starts.sparse_rows` builds the programs.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def _sides(problem: Problem, i: int) -> Iterator[Face]:
 
 
 def _sides_of_members(problem: Problem, i: int, union: AnyOf) -> Iterator[Face]:
-    """Yield the combinations of bounds of each member of a union, at most as many as there are dimensions."""
+    """Yield the combinations of up to d bounds of each member of a union, in d dimensions."""
     for m, member in enumerate(union.members):
         bands = [[Level(i, (m, b, side)) for side in finite_sides(band)] for b, band in enumerate(member)]
         for count in range(1, min(problem.dimension, len(bands)) + 1):

@@ -51,8 +51,8 @@ def chance(fix: Fix, region: Any) -> Array:
     Raises
     ------
     InvalidProblem
-        If the region is empty, exact, depends on a velocity, or belongs to several targets or to a target with one
-        position for each epoch.
+        If the region is empty or exact, or depends on a velocity. Also if it belongs to several targets, or to a
+        target with one position for each epoch.
     """
     demands = tuple(c for given in _listed(region) for c in _listed(given))
     name = _position_name(fix, demands)
@@ -102,7 +102,7 @@ def _frame_for(fix: Fix, demands: tuple[Any, ...]) -> Problem:
     problem = Problem(stations, (), Noise(()), np.zeros(1), (Motion(),), frame=fix.frame, constraints=demands)
     if problem.batch_shape not in ((), fix.shape):
         what = f"the region has batch axes {problem.batch_shape}, and the fix has {fix.shape}"
-        raise InvalidProblem(what, "region", "give numbers without batch axes, or with those of the fix")
+        raise InvalidProblem(what, "region", "give numbers without batch axes, or with the batch axes of the fix")
     return problem.flat() if problem.batch_shape else problem
 
 

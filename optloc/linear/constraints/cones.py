@@ -21,7 +21,7 @@ from optloc.linear.constraints.single_bounds import Face, Level, bound_of, level
 from optloc.linear.constraints.violation import TOLERANCE, member_violation, plan_positions
 from optloc.problem.problem import Problem
 
-# Square of the share of a gradient that outward normals may leave over: the gradient is taken slightly beside a bound.
+# Square of the share of a gradient that outward normals may leave over: the gradient is taken near a bound, not on it.
 # Second: the same in units of chi-square, below which a point counts as stationary.
 _LEFT, _STATIONARY = 1e-6, 1e-10
 
@@ -85,7 +85,7 @@ def _is_held_by_all(
 ) -> Array:
     """Return flags (N,) of points that are minima of every combination of members that contain them.
 
-    `unions` are the numbers of the unions with a level in the face. The other arguments are those of `is_held`.
+    `unions` are the numbers of the unions with a level in the face. The other arguments are as in `is_held`.
     """
     own = tuple(level for level in face if level.constraint not in unions)
     choices = []

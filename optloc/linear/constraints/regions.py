@@ -284,7 +284,7 @@ def quantity(
     table : object, optional
         Data of the quantity, for instance an `optloc.models.terrain.Terrain`.
     name : str
-        Name in reports; that of the quantity by default.
+        Name in reports; by default the name of the quantity.
     """
     if kind not in SURFACES:
         raise InvalidProblem(f"unknown quantity {kind!r}", name or "quantity", nearest(kind, SURFACES))

@@ -161,7 +161,7 @@ def speed(
     Parameters
     ----------
     upper, lower : float or str
-        Greatest and least speed; a lower limit of zero is none.
+        Greatest and least speed. A lower limit of zero has no effect.
     target : int
         Number of the target.
     along : bool

@@ -19,7 +19,7 @@ def violation(problem: Problem, x: Array) -> Array:
     """Return the violation (N,) of the worst constraint at vectors x (N, size); 0 if all constraints are satisfied.
 
     The violation is divided by one plus the absolute bound, or for a polygon by one plus its greatest coordinate. For a
-    union, it is that of the member which is violated least.
+    union, it is the violation of the least violated member.
     """
     worst = np.zeros(len(x))
     for c in problem.constraints:

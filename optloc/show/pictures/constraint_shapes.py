@@ -122,7 +122,7 @@ class _Plan:
             yield from self._of_band(c)
 
     def fence(self, fence: Fence) -> Iterator[DrawnRegion]:
-        """Yield the stated line of a fence, and the lines one standard deviation beside it."""
+        """Yield the stated line of a fence, and its parallels at a distance of one standard deviation."""
         if np.ndim(fence.offset):
             return
         place, sigma = float(fence.offset), float(fence.sigma)
@@ -170,7 +170,7 @@ class _Plan:
             return []
         foot = self.centre + across * (bound - float(across @ self.centre)) / size
         along = sign * np.array([across[1], -across[0]]) / np.sqrt(size)
-        # The side on the left of `along` is that of sign * (-across): below a lower, above an upper bound.
+        # The line runs against `along`, so sign * (-across) points to its left: below a lower, above an upper bound.
         ends = np.array([[1.0], [-1.0]]) * _LONG * self.scale * along
         return [foot + ends]
 
@@ -215,7 +215,7 @@ class _Plan:
         from matplotlib.ticker import MaxNLocator
 
         ground = band.table
-        # A grid that is finer than that of the file, so that contours follow the spline between its points.
+        # A grid that is finer than the grid of the file, so that contours follow the spline between its points.
         x, y = (np.linspace(axis[0], axis[-1], max(_GRID, len(axis))) for axis in (ground.x, ground.y))
         heights = ground.at(*np.meshgrid(x, y))[0]
         levels = MaxNLocator(_CONTOURS).tick_values(heights.min(), heights.max())

@@ -145,8 +145,8 @@ def pose_network(network: Network, *, truncated: bool = True) -> PosedNetwork:
     network : Network
         Arrivals at stations with one clock, none missing.
     truncated : bool
-        Whether the objective is that of the last pass, in which the largest singular values are free. False: the
-        nuclear norm of all of them, the first pass.
+        Whether to use the objective of the last pass, in which the largest singular values are free. False: the
+        objective of the first pass, the nuclear norm of all of them.
 
     Returns
     -------
@@ -156,7 +156,7 @@ def pose_network(network: Network, *, truncated: bool = True) -> PosedNetwork:
     Raises
     ------
     InvalidProblem
-        If stations have clocks of their own, an arrival is missing, or there are too few of them.
+        If stations have separate clocks, an arrival is missing, or there are too few arrivals.
 
     References
     ----------

@@ -207,7 +207,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
 
 @dataclass(frozen=True, slots=True)
 class EnclosedRanges:
-    """The ranges of one problem and the box of all positions with a cost as low as that of its fix.
+    """The ranges of one problem, and a box around all positions up to a greatest cost.
 
     Parameters
     ----------
@@ -233,9 +233,9 @@ class EnclosedRanges:
 
 
 def enclosed_ranges(problem: Problem, fix: Fix, margin: float) -> EnclosedRanges | str:
-    """Return the ranges and the box of a flat batch of one problem, or the reason why there are none.
+    """Return the ranges and the box of a flat batch of one problem, or the reason why they do not exist.
 
-    The box contains the positions whose chi-square is at most `margin` above that of the fix.
+    The box contains the positions whose chi-square is at most `margin` above the chi-square of the fix.
     """
     why = _beyond(problem) or _beyond_moments(problem)
     found = None if why else ranges(problem_at_rest(problem))
@@ -251,7 +251,7 @@ def _places(problem: Problem, found: Ranges) -> Array:
 def _enclosed(
     found: Ranges, place: Array, fix: Fix, i: int, region: float | None, margin: float = _MARGIN
 ) -> EnclosedRanges | str:
-    """Return the ranges and the box of problem i, or the reason why there are none; `region` is in metres."""
+    """Return the ranges and the box of problem i, or the reason why they do not exist; `region` is in metres."""
     why = _declined(found, i, bool(fix.answered[i]))
     if why:
         return why

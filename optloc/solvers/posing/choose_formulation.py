@@ -86,7 +86,7 @@ def _named(problem: Problem, text: str) -> str:
         return found[0]
     if len(found) > 1:
         raise InvalidProblem(
-            f"{text!r} stands for several formulations", "formulation", f"use {' or '.join(map(repr, found))}"
+            f"{text!r} is the name of several formulations", "formulation", f"use {' or '.join(map(repr, found))}"
         )
     parts = [name for name in entries if name.partition(": ")[2] == text]
     if len(parts) == 1:

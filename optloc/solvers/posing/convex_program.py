@@ -49,7 +49,7 @@ class ConvexProgram:
         self.restate()
 
     def restate(self) -> None:
-        """Write the program that is solved, and the problem with the cost itself, anew after a change."""
+        """Rewrite the program that is solved, and the problem with the cost itself, after a change."""
         import cvxpy as cp
 
         rules = [*self.base.constraints, *(part for one in self.relations.values() for part in one.parts)]
@@ -157,9 +157,10 @@ class ConvexProgram:
         solver : str
             Name of the solver in cvxpy.
         settings : mapping, optional
-            Its settings, which replace those of the program.
+            Its settings, which replace the settings of the program.
         warm : bool
-            Whether to start from an earlier solution. An interior-point solver ignores it, and the message says so.
+            Whether to start from an earlier solution. An interior-point solver ignores it and reports this in
+            the message.
         start : mapping of str to array, optional
             Values of the variables by name.
 
@@ -185,7 +186,7 @@ class ConvexProgram:
             report = solve_problem(self.program, solver, own, warm=warm)
             if solver == "CLARABEL" and report.outcome in ("failed", "inaccurate") and not report.worst <= _FINE:
                 again = solve_problem(self.program, solver, {**_REGULAR, **own})
-                # the values on the variables are those of the last solve
+                # the variables keep the values of the last solve
                 better = again.worst <= report.worst or not np.isfinite(report.worst)
                 report = again if better else solve_problem(self.program, solver, own)
         except ValueError as trouble:
@@ -216,7 +217,7 @@ class ConvexProgram:
         return {one.name(): np.array(one.value) for one in self.program.variables()}
 
     def bound(self) -> float:
-        """Return a lower bound of the objective, recomputed from a dual point of Clarabel; NaN if there is none."""
+        """Return a lower bound of the objective, recomputed from a dual point of Clarabel; NaN without a bound."""
         from formulations.backend import SolverError
         from formulations.conic import Relaxation
 

@@ -1,4 +1,4 @@
-"""What a formulation says about one problem: the cvxpy problem, its expressions in SI units, and how to read it."""
+"""One problem as a formulation states it: a cvxpy problem, expressions in SI units, and functions that read it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ConicStatement:
     residual : expression, optional
         Residuals (m,) of the rows of the formulation, standard deviations.
     missing : mapping of str to str
-        For parts that users may expect: why there is none.
+        The reason why the formulation lacks a part that users may expect.
     read : callable
         Returns starting vectors (q, size) from the values of the variables, the point of the relaxation first.
     rank_ratio : callable

@@ -166,7 +166,7 @@ def _whitened(form: Array, size: float) -> tuple[Array, Array, float]:
     """Return a change of unknowns after which residuals are standard deviations, their products, and the unit of these.
 
     `form` (m, n) are the whitened rows in y, whose first entry is 1. Without the change, a cost of a few standard
-    deviations is rounding beside the squares of the ranges, of which `size` is the unit.
+    deviations would be below the rounding error of the squared ranges. `size` is the unit of these squares.
     """
     n = form.shape[1]
     change = np.eye(n)

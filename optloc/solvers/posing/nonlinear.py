@@ -141,7 +141,7 @@ class PosedProgram(Posed):
         return np.asarray((self._candidates()[0] - self._own.centre) / self._own.unit)
 
     def _candidates(self) -> Array:
-        """Return starting vectors (q, size) in SI units, from closed forms, or from a search if there are none."""
+        """Return starting vectors (q, size) in SI units, from closed forms, or else from a search."""
         if self._starts is None:
             problem = replace(self._own.problem, constraints=())
             found = Method.parse("gtrs")(problem, None).x[0]
@@ -279,7 +279,7 @@ class PosedProgram(Posed):
         return Relation(name, tuple(parts), tuple(divisor), free=False)
 
     def _restate(self) -> None:
-        """Write the statement with the constraints and the objective anew."""
+        """Rewrite the statement with the constraints and the objective."""
         import casadi as ca
 
         parts = [part for one in self.relations.values() for part in one.parts]

@@ -249,7 +249,7 @@ class Posed(ABC):
 
     @abstractmethod
     def _restate(self) -> None:
-        """Write `problem` anew after a change."""
+        """Rewrite `problem` after a change."""
 
     # The fix.
 

@@ -91,7 +91,7 @@ class PosedConic(Posed):
         self._restate()
 
     def _restate(self) -> None:
-        """Write `problem` anew after a change."""
+        """Rewrite `problem` after a change."""
         self._convex.restate()
         self.problem = self._convex.problem
 
@@ -190,5 +190,5 @@ class PosedConic(Posed):
 
 
 def _rows_of(slope: Mapping[Any, Array], one: Any, size: int) -> Array:
-    """Return the derivatives (size, entries) by a variable; zeros if there are none."""
+    """Return the derivatives (size, entries) by a variable; zeros if `slope` does not contain it."""
     return slope[one] if one in slope else np.zeros((size, one.size))

@@ -16,13 +16,13 @@ from optloc.solvers.certificates.relaxations import enclosed_ranges
 from optloc.solvers.posing.convex_statement import ConicStatement, Locate, set_parameters, variable
 from optloc.solvers.starts.position import height_sights, spread_of
 
-# Chi-square above that of the fix up to which positions are in the box of moments: a constraint may move the optimum
-# by four standard deviations. A larger box is less tight.
+# Positions are in the box of moments if their chi-square is at most this far above the chi-square of the fix. So a
+# constraint may move the optimum by four standard deviations. A larger box is less tight.
 _MARGIN = 16.0
 
 
 def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
-    """Return the moment relaxation of a flat batch of one problem, in the box of costs as low as that of its fix.
+    """Return the moment relaxation of a flat batch of one problem, in the box of positions near its fix.
 
     `locate` maps the problem to its fix.
     """
@@ -59,7 +59,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
             "range": about.size * (middle + half * y[place[0, -1]]),
         },
         residual=data.white @ first,
-        within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above that of the fix",
+        within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above the chi-square of the fix",
         read=read,
         rank_ratio=lambda: rank_ratio(y.value[place]),
         settings=settings_of(),
@@ -124,7 +124,7 @@ def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
     station = (place - origin) / unit
     values, _, _ = lifted_data(rows, right, station)
     count, d = station.shape
-    # ranges in standard deviations: a cost of a few of them is else rounding beside the squares of the ranges
+    # ranges in standard deviations: otherwise a small cost would be below the rounding error of the squared ranges
     change, inner = np.eye(1 + d + count), in_deviations(rows, right)
     change[1 + d :, 1 + d :], change[1 + d :, 0] = inner[:, :-1], inner[:, -1]
     table = np.concatenate([(rows @ inner[:, -1] - right)[:, None], rows @ inner[:, :-1]], axis=1)

@@ -1,6 +1,6 @@
 """Squared ranges as posed problems: Shor's semidefinite relaxation, and the second-order cone.
 
-The rows are those of the last weighting of `optloc.solvers.starts.squared_range`.
+The rows have the last weights of `optloc.solvers.starts.squared_range`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _NO_RANGE = "the last unknown is the square of the distance, and no range is an 
 class _Weighted:
     """The rows (m, n) and right sides (m,) of one problem, in the coordinates of `squared`.
 
-    `change` (n, n + 1) maps (w, 1) to the coordinates y. The unknowns w of the programs are in standard deviations, so
-    that the value of a program is accurate if the noise is small compared with the distances.
+    `change` (n, n + 1) maps (w, 1) to the coordinates y. The unknowns w of the programs are in standard deviations.
+    So the value of a program is accurate even if the noise is small compared with the distances.
     """
 
     squared: Squared
@@ -124,8 +124,8 @@ def _statement(
 ) -> ConicStatement:
     """Return the statement of a relaxation whose first moments are the expression w (n,), in standard deviations.
 
-    `scale` is the unit of the residuals of the program, `points` returns points y (q, n), `ratio` the rank ratio, and
-    `settings` are the settings of Clarabel.
+    `scale` is the unit of the residuals of the program. `points` returns points y (q, n), and `ratio` returns the rank
+    ratio. `settings` are the settings of Clarabel.
     """
     squared, y = given.squared, given.y(w)
     origin, unit, d = squared.origin[0], float(squared.scale[0]), problem.dimension

@@ -320,7 +320,7 @@ def _departure(problem: Problem, pool: Pool) -> Array:
         out[items] = departure(problem.take(items), x[items], covariance[items], sides[number], centre[items])
         if len(sides[number]) > len(sides[0]):
             inwards, bent = _departure_inwards(problem.take(items), take(pool, items))
-            # along a bent bound the rise of the cost is not that of the cost alone
+            # along a bent bound, the rise of the cost also depends on the curvature of the bound
             out[items] = np.where(bent[:, None], inwards[:, None], np.fmax(out[items], inwards[:, None]))
     return out
 
@@ -328,8 +328,8 @@ def _departure(problem: Problem, pool: Pool) -> Array:
 def _departure_inwards(problem: Problem, pool: Pool) -> tuple[Array, Array]:
     """Return the departure (N,) of the cost from a Gaussian's, on the inner side of active bounds.
 
-    It is infinite if the truncated law of a fix is not valid. The second result (N,) flags laws whose admitted points a
-    function tells.
+    It is infinite if the truncated law of a fix is not valid. The second result (N,) flags laws with a function that
+    tests whether points are admitted.
     """
     law, none = law_at(problem, pool), np.zeros(len(pool), dtype=bool)
     if law is None:
