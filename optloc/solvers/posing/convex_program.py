@@ -218,7 +218,10 @@ class ConvexProgram:
         return bool(solve_problem(self.program, solver, {}).status != "error")
 
     def _solve_smaller(self, report: Any, settings: Mapping[str, Any]) -> Any:
-        """Return the report of an attempt with a smaller objective, which has the same solution; or else `report`."""
+        """Return the report of an attempt with a smaller objective, which has the same solution; or else `report`.
+
+        A report that no point exists becomes a failure if a point is found without the objective.
+        """
         import cvxpy as cp
 
         from formulations.conic_solvers import solve_problem
@@ -229,6 +232,11 @@ class ConvexProgram:
             if found.outcome in ("solved", "inaccurate") and self._is_met():
                 self._factor = factor
                 return found
+        if report.outcome == "infeasible":
+            without = solve_problem(cp.Problem(cp.Minimize(0.0), self.program.constraints), "CLARABEL", settings)
+            if without.outcome in ("solved", "inaccurate") and self._is_met():
+                text = "it reports that no point meets the constraints, but one does; the solution is far from the data"
+                report = replace(report, outcome="failed", message=text)
         # no value of an attempt that failed remains
         for one in self.program.variables():
             one.value = None
