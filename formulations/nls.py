@@ -301,7 +301,8 @@ class Program:
         Returns
         -------
         Local
-            A local minimiser, or the last iterate and the reason of the failure.
+            A local minimiser, or the last iterate and the reason of the failure. At a start without a finite gradient
+            no solver runs.
         """
         data = self.data(z, weight, p, prior)
         constraints = self._equal + self._more
@@ -316,6 +317,9 @@ class Program:
             "lbg": np.zeros(constraints),
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
+        if not np.isfinite(self._check(given["x0"], data)[0].full()).all():
+            # a solver may never return from such a start, as fatrop does
+            return self._without_gradient(given["x0"], data)
         try:
             with self.lock, silent(self._name):
                 found, stats = self._solver(**given), self._solver.stats()
@@ -343,6 +347,16 @@ class Program:
             success=success,
             iterations=iterations,
             report=nonlinear_report(self._name, stats, status, success=success),
+        )
+
+    def _without_gradient(self, start: Array, data: Array) -> Local:
+        """Return a failure at a start where the cost has no finite gradient; `data` are the parameters of the solve."""
+        status = "the cost has no gradient at the start"
+        record(Ending(self._name, status, "", found=False))
+        report = SolverReport(self._name, status)
+        bounds, equalities, inequalities = np.zeros(self.n), np.zeros(self._equal), np.zeros(self._more)
+        return Local(
+            start, np.nan, bounds, equalities, inequalities, status, success=False, iterations=0, report=report
         )
 
     def _contradiction(self, x: Any, data: Array, status: str) -> str:

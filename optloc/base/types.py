@@ -457,8 +457,8 @@ _SENTENCES: dict[Status, str] = {
     "the method 'auto', or accept this status with 'allow'.",
     Status.CURVED: "The position is right, but the error ellipse in metres is not valid; use the fix's chart, its "
     "interval, or optloc.uncertainty.likelihood_region.",
-    Status.UNREFINED: "This is the estimate of a start, without refinement and verdict; append '+lsr+certify' to the "
-    "method.",
+    Status.UNREFINED: "This estimate is not refined or judged; append '+lsr+certify' to the method, or for a pose use "
+    "refine=True or a constraint of optloc.constraints.",
     Status.UNCHECKED: "No redundancy: a wrong measurement would not be noticed; add a station, a measurement or a "
     "known height.",
     Status.TAILS: "Repeats of the measurement confirm the 95 % figures, but not the 99.9 % region.",

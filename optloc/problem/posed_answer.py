@@ -28,7 +28,9 @@ class PosedAnswer:
     value : float
         Objective at the solution: chi-square, unless you or the formulation replace it.
     bound : float
-        Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound.
+        Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound. It bounds
+        the cost of maximum likelihood for "moment_sdp" and "direction_sdp" only. The other formulations minimise other
+        residuals, for instance those of squared ranges.
     rank_ratio : float
         Second over first eigenvalue of a lifted matrix, or distance from the relaxed surface; NaN if nothing is lifted.
         A value near zero means that the relaxation is exact.

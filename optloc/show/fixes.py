@@ -248,9 +248,12 @@ def _coordinates(fix: Fix) -> list[tuple[str, str]]:
 def _chi_square(fix: Fix) -> str:
     """Return the cost, the degrees of freedom and the p-value as text, with a warning if the p-value is small.
 
-    Without redundancy or without a finite cost, the text states that there is no test.
+    Without redundancy or without a finite cost, the text states why there is no test.
     """
-    if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
+    # a fix that failed before its rows were counted has zero degrees of freedom
+    if not np.isfinite(fix.cost) and int(fix.dof) >= 0:
+        return "not computed: there is no refined answer"
+    if int(fix.dof) <= 0:
         return "no redundancy: nothing to test"
     p = float(fix.p_value)
     warning = "; the residuals are larger than the stated noise allows" if p < _UNLIKELY else ""

@@ -41,7 +41,8 @@ def pose(problem: Problem, formulation: str) -> Posed:
     entry = FORMULATIONS[name]
     if entry.pose is None:
         twin = entry.twin or "nls"
-        raise InvalidProblem(f"{name!r} is a closed form and no optimisation problem", "formulation", f"pose {twin!r}")
+        known = f"{formulation!r} stands for {name!r}, which" if formulation != name else f"{name!r}"
+        raise InvalidProblem(f"{known} is a closed form and no optimisation problem", "formulation", f"pose {twin!r}")
     if not entry.serves(one) and entry.starts:
         raise InvalidProblem(
             f"{name!r} does not cover this problem: it supports {entry.kinds}", "formulation", "use 'nls'"
@@ -93,4 +94,19 @@ def _named(problem: Problem, text: str) -> str:
         return parts[0]
     if by_word:
         return by_word[0]
-    raise InvalidProblem(f"unknown formulation {text!r}", "formulation", nearest(text, entries))
+    raise InvalidProblem(f"unknown formulation {text!r}", "formulation", _advice(text, list(entries)))
+
+
+def _advice(text: str, names: list[str]) -> str:
+    """Return advice for an unknown word: what it is in a method, or the most similar names of formulations."""
+    from optloc.solvers.methods import METHODS, SOLVERS
+
+    if text in METHODS or text in SOLVERS:
+        what = "method" if text in METHODS else "stage of methods"
+        return f"{text!r} is a {what} of optloc.solve; use 'nls', or see 'optloc list formulations'"
+    # the second half of a name, such as "hull", is a name too
+    hint = nearest(text, [*names, *(short for name in names if (short := name.partition(": ")[2]))])
+    # eighteen names are too many to read: the table lists them with a line each
+    similar, mark, _ = hint.partition("?")
+    listing = "see 'optloc list formulations'"
+    return f"{similar}? {listing}" if mark else listing

@@ -15,6 +15,11 @@ from optloc.solvers.posing.convex_statement import Relation
 
 # Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
 _SEED = 20261130
+# Factors of the objective for further attempts of Clarabel if it finds no solution. Far from the data the cost is 1e8
+# times the objective's size, and Clarabel takes the large duals for a proof that no point exists.
+_SMALLER = (1e-3, 1e-6)
+# Largest violation of a rule, in its unit of order one, at which a further attempt found a point.
+_MET = 1e-5
 # If Clarabel stops early with a larger residual than this, its factorisation may have lost its digits. The settings are
 # for a second attempt, as in `formulations.conic`.
 _FINE = 1e-7
@@ -46,6 +51,8 @@ class ConvexProgram:
         self.settings: dict[str, float] = dict(settings or {})
         self.goal = program.objective.args[0]
         self.relations: dict[str, Relation] = {}
+        # duals are of the goal times this factor
+        self._factor = 1.0
         self.restate()
 
     def restate(self) -> None:
@@ -172,10 +179,11 @@ class ConvexProgram:
         Raises
         ------
         InvalidProblem
-            If the solver is unknown or does not support the cones of the problem.
+            If the solver is unknown, does not support the cones of the problem, or refuses a setting.
         """
         from formulations.conic_solvers import SOLVERS, solve_problem
 
+        self._factor = 1.0
         takes = solver in SOLVERS and SOLVERS[solver].takes_start
         own = {**(self.settings if solver == "CLARABEL" else {}), **(settings or {})}
         for one in self.program.variables() if warm and takes else ():
@@ -189,12 +197,61 @@ class ConvexProgram:
                 # the variables keep the values of the last solve
                 better = again.worst <= report.worst or not np.isfinite(report.worst)
                 report = again if better else solve_problem(self.program, solver, own)
+            if solver == "CLARABEL" and self.relations and report.outcome in ("failed", "infeasible"):
+                report = self._solve_smaller(report, own)
         except ValueError as trouble:
             raise InvalidProblem(str(trouble), "solver", "see 'optloc list solvers'") from None
+        if report.status == "error" and settings and self._is_caused_by_settings(solver):
+            names = ", ".join(map(str, settings))
+            plural = "s" if len(settings) > 1 else ""
+            raise InvalidProblem(
+                f"{solver} does not accept the setting{plural} {names}", "settings", "check names and values"
+            )
         if warm and not takes:
             text = f"{solver} does not use start and duals, because it is an interior-point or simplex method"
             report = replace(report, message="; ".join(filter(None, [report.message, text])))
         return report
+
+    def _is_caused_by_settings(self, solver: str) -> bool:
+        """Return whether a solver that raised an error raises none without the settings of the user."""
+        from formulations.conic_solvers import solve_problem
+
+        return bool(solve_problem(self.program, solver, {}).status != "error")
+
+    def _solve_smaller(self, report: Any, settings: Mapping[str, Any]) -> Any:
+        """Return the report of an attempt with a smaller objective, which has the same solution; or else `report`.
+
+        A report that no point exists becomes a failure if a point is found without the objective.
+        """
+        import cvxpy as cp
+
+        from formulations.conic_solvers import solve_problem
+
+        for factor in _SMALLER:
+            found = solve_problem(cp.Problem(cp.Minimize(factor * self.goal), self.program.constraints), "CLARABEL",
+                                  settings)  # fmt: skip
+            if found.outcome in ("solved", "inaccurate") and self._is_met():
+                self._factor = factor
+                return found
+        if report.outcome == "infeasible":
+            without = solve_problem(cp.Problem(cp.Minimize(0.0), self.program.constraints), "CLARABEL", settings)
+            if without.outcome in ("solved", "inaccurate") and self._is_met():
+                text = "it reports that no point meets the constraints, but one does; the solution is far from the data"
+                report = replace(report, outcome="failed", message=text)
+        # no value of an attempt that failed remains
+        for one in self.program.variables():
+            one.value = None
+        return report
+
+    def _is_met(self) -> bool:
+        """Return whether the values of the variables meet the constraints, each in its unit of order one.
+
+        A constraint of the position alone never contradicts a relaxation. The rules of the relaxation itself are tested
+        only beside other relations, since far from the data their numbers are large.
+        """
+        free = any(one.free for one in self.relations.values())
+        rules = self.program.constraints if free else [part for one in self.relations.values() for part in one.parts]
+        return all(np.max(one.violation(), initial=0.0) <= _MET for one in rules)
 
     def has_solution(self, report: Any) -> bool:
         """Return whether a report is of a solution, and all variables have finite values."""
@@ -208,7 +265,9 @@ class ConvexProgram:
         values: dict[str, float | Array] = {}
         for name, one in self.relations.items():
             pairs = list(zip(one.parts, one.divisor, strict=True))
-            duals[name] = joined([self.size * _dual(part) / unit if solved else np.nan * unit for part, unit in pairs])
+            duals[name] = joined(
+                [self.size / self._factor * _dual(part) / unit if solved else np.nan * unit for part, unit in pairs]
+            )
             values[name] = joined([_value(part) * unit if solved else np.nan * unit for part, unit in pairs])
         return duals, values, float(self.size * self.goal.value + self.constant) if solved else np.nan
 

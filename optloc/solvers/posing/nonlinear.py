@@ -25,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.methods import METHODS, Method
 from optloc.solvers.posing.convex_constraints import members_of
 from optloc.solvers.posing.convex_statement import Relation
-from optloc.solvers.posing.posed import Posed
+from optloc.solvers.posing.posed import Posed, numbers_of_start
 from optloc.solvers.scaled_program import ScaledProblem
 
 # Most iterations of IPOPT, as in the method "nlp".
@@ -384,25 +384,16 @@ class PosedProgram(Posed):
 
     def _vector_of(self, start: Any) -> Array:
         """Return a vector (size,) in SI units from an earlier fix, a vector or a position."""
-        try:
-            value = np.asarray(start.x if isinstance(start, Fix) else self._of_answer(start), dtype=float).ravel()
-        except (TypeError, ValueError):
-            raise InvalidProblem(
-                "start is no vector of numbers", "start", "give a fix, a vector or a position"
-            ) from None
         size, layout = self._program.n, self._own.problem.layout
+        value = numbers_of_start(self._of_answer(start), (size, layout.n_shared, len(self.origin)))
         if len(value) == size:
             return value
         if len(value) == layout.n_shared:
             return np.asarray(complete(self._own.problem, value[None, None])[0, 0], dtype=float)
-        if len(value) == len(self.origin):
-            out: Array = self._candidates()[0].copy()
-            slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
-            out[slot.start : slot.start + slot.size] = value
-            return out
-        raise InvalidProblem(
-            f"start has {len(value)} numbers, not {size}", "start", "give a fix, a vector or a position"
-        )
+        out: Array = self._candidates()[0].copy()
+        slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
+        out[slot.start : slot.start + slot.size] = value
+        return out
 
     def _of_answer(self, start: Any) -> Any:
         """Return the vector of an earlier posed answer in SI units; any other start unchanged."""
@@ -483,8 +474,18 @@ class PosedProgram(Posed):
         gap = float(np.abs(found.inequalities * more.ravel()).sum()) / (1.0 + abs(found.cost))
         return float(primal), float(np.abs(slope.ravel() + pull + found.bounds).max() / size), gap
 
+    def _kinks(self) -> str:
+        """Return a sentence about an objective of the user that is not smooth; "" for a smooth one."""
+        kinks = _kinks_of(self._goal) if self.own_objective else []
+        if not kinks:
+            return ""
+        return (
+            f"your objective is not smooth, because it contains {' and '.join(kinks)}: pose it in a convex "
+            "formulation, or use a smooth one such as sqrt(1 + residual**2)"
+        )
+
     def _explain_failure(self, found: Local, answer: PosedAnswer) -> Fix:
-        """Return a fix without an answer and its reason, from the status of the solver."""
+        """Return the fix after a failure and its reason, from the status of the solver."""
         status, outcome = found.status.lower(), found.report.outcome
         if outcome == "infeasible" or "restoration" in status:
             return self._failed(Status.INFEASIBLE, f"no point meets the posed problem{self._changes()}", answer)
@@ -493,8 +494,29 @@ class PosedProgram(Posed):
             return self._failed(
                 Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
             )
+        if kinks := self._kinks():
+            text = f"{answer.backend.backend}: {found.status}; {kinks}"
+            return self._failed(Status.NUMERICAL, text, answer)
         code = Status.MAX_ITERATIONS if "iteration" in status else Status.NUMERICAL
         return self._failed(code, f"{answer.backend.backend}: {found.status}", answer)
+
+
+def _kinks_of(expression: Any) -> list[str]:
+    """Return the names of functions in an expression of CasADi that have no derivative everywhere."""
+    import casadi as ca
+
+    names = {
+        ca.OP_FABS: "fabs",
+        ca.OP_FMIN: "fmin",
+        ca.OP_FMAX: "fmax",
+        ca.OP_SIGN: "sign",
+        ca.OP_FLOOR: "floor",
+        ca.OP_CEIL: "ceil",
+        ca.OP_IF_ELSE_ZERO: "if_else",
+    }
+    function = ca.Function("kinks", ca.symvar(expression), [expression])
+    used = {function.instruction_id(k) for k in range(function.n_instructions())}
+    return [name for code, name in names.items() if code in used]
 
 
 def _report(

@@ -23,6 +23,9 @@ from optloc.solvers.solution import with_sources
 from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 
 _REFINEMENT = Method(("lsr", "certify"))
+# With constraints, least squares from the posed solution alone may miss the minimum on their faces, or the minimum
+# without them that shows a contradiction. So the solution competes with the starts of `optloc.solve`.
+_CONSTRAINED = "auto"
 
 
 class Posed(ABC):
@@ -233,6 +236,8 @@ class Posed(ABC):
         -------
         Fix
             A solution that is not refined has the status `unrefined` and no covariance. A failed solve is a status.
+            With constraints that hold for the fix too, the solution and the starts of `optloc.solve` compete in the
+            refinement. If the back end finds no solution then, the reason says so, and the starts alone are refined.
         """
 
     @abstractmethod
@@ -267,7 +272,7 @@ class Posed(ABC):
             fix = _of_pool(self.stated, starts[:1], None)
             reason = f"the optimum of the posed problem{self._changes()}, not refined"
             return _marked(fix, Status.UNREFINED, reason, replace(answer, refined=False))
-        fix = _of_pool(self.stated, pack(starts[None])[0], _REFINEMENT)
+        fix = _of_pool(self.stated, pack(starts[None])[0], self._refinement)
         answer = replace(answer, refined=True)
         if not (self.free or self.own_objective):
             return replace(fix, posed=answer)
@@ -278,6 +283,24 @@ class Posed(ABC):
             return replace(fix, reason=_joined(fix.reason, reason), posed=answer)
         first = Status.UNPROVEN if int(fix.code) in (Status.OK, Status.CURVED) else Status(int(fix.code))
         return _marked(fix, first, f"{reason}; {fix.reason[()]}".rstrip("; "), answer)
+
+    @property
+    def _refinement(self) -> Method:
+        """Return the method that refines and judges solutions."""
+        return Method.parse(_CONSTRAINED) if self.stated.constraints else _REFINEMENT
+
+    def _without_solution(self, code: Status, reason: str, answer: PosedAnswer, refine: bool | None) -> Fix:
+        """Return the fix after a back end found no solution, although it may exist.
+
+        If all changes are constraints of the problem too, `optloc.solve` answers, and the reason names the failure.
+        """
+        if self.stated.constraints and refine is not False and not (self.free or self.own_objective):
+            fix = _of_pool(self.stated, np.full((1, self.stated.layout.size), np.nan), self._refinement)
+            # a contradiction or a run to infinity is an answer of `optloc.solve` too
+            if int(fix.code) not in (Status.NUMERICAL, int(code)):
+                text = f"the posed problem has no solution by {answer.backend}; the starts are of the method 'auto'"
+                return replace(fix, reason=_joined(fix.reason, text), posed=replace(answer, refined=False))
+        return self._failed(code, reason, answer)
 
     def _changes(self) -> str:
         """Return the changes of the posed problem as the end of a sentence."""
@@ -291,6 +314,26 @@ class Posed(ABC):
         """Return a fix without an answer."""
         fix = replace(with_sources(self.stated, failed_fixes(self.stated, reason)).reshape(()), marks=None)
         return _marked(fix, code, reason, replace(answer, refined=False))
+
+
+def numbers_of_start(start: Any, sizes: Sequence[int]) -> Array:
+    """Return a start as a vector; raise InvalidProblem if it is no vector of numbers, or has a wrong length.
+
+    Parameters
+    ----------
+    start : Fix or array
+        An earlier fix, or numbers.
+    sizes : sequence of int
+        Valid lengths, the one of a whole vector first.
+    """
+    advice = "give a fix, a vector or a position"
+    try:
+        value = np.asarray(start.x if isinstance(start, Fix) else start, dtype=float).ravel()
+    except (TypeError, ValueError):
+        raise InvalidProblem("start is no vector of numbers", "start", advice) from None
+    if len(value) not in sizes:
+        raise InvalidProblem(f"start has {len(value)} numbers, not {sizes[0]}", "start", advice)
+    return value
 
 
 def _table_members(constraint: Any) -> list[Constraint] | None:

@@ -16,7 +16,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
 from optloc.solvers.posing.convex_statement import ConicStatement, Relation
-from optloc.solvers.posing.posed import Posed
+from optloc.solvers.posing.posed import Posed, numbers_of_start
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
@@ -158,6 +158,9 @@ class PosedConic(Posed):
         """Return the judged fix of the posed problem; see `Posed.solve`."""
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
         earlier = getattr(start, "posed", start)
+        if not (start is None or isinstance(earlier, PosedAnswer)):
+            layout = self.stated.layout
+            numbers_of_start(start, (layout.size, layout.n_shared, self.stated.dimension))
         first = earlier.variables if isinstance(earlier, PosedAnswer) else None
         report = self._convex.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=first)
         solved = self._convex.has_solution(report)
@@ -173,20 +176,24 @@ class PosedConic(Posed):
             refined=False,
             variables=self._convex.variables() if solved else {},
         )
-        return self._conclude(self.statement.read(), answer, refine) if solved else self._explain_failure(answer)
+        if solved:
+            return self._conclude(self.statement.read(), answer, refine)
+        return self._explain_failure(answer, refine)
 
-    def _explain_failure(self, answer: PosedAnswer) -> Fix:
-        """Return a fix without an answer and its reason, from the outcome of the back end."""
+    def _explain_failure(self, answer: PosedAnswer, refine: bool | None) -> Fix:
+        """Return the fix after a failure and its reason, from the outcome of the back end."""
         report = answer.backend
         if report.outcome == "infeasible":
             text = f"no point meets the posed problem{self._changes()} {self.statement.within}".rstrip()
-            return self._failed(Status.INFEASIBLE, text, answer)
+            if self.statement.within:  # there may be points outside these limits, and the sentence names them
+                return self._failed(Status.INFEASIBLE, text, answer)
+            return self._without_solution(Status.INFEASIBLE, text, answer, refine)
         if report.outcome == "unbounded":
             what = "your objective" if self.own_objective else "the objective"
             return self._failed(
                 Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
             )
-        return self._failed(Status.NUMERICAL, str(report), answer)
+        return self._without_solution(Status.NUMERICAL, str(report), answer, refine)
 
 
 def _rows_of(slope: Mapping[Any, Array], one: Any, size: int) -> Array:

@@ -19,11 +19,14 @@ _NO_POSITION = (
 _NO_ANGLES = "angles are not convex in the position"
 
 
-def _seen(problem: Problem) -> Bearings:
+def _seen(problem: Problem, formulation: str) -> Bearings:
     """Return the angles of a flat batch of one problem; raise InvalidProblem without azimuths of one position."""
     seen = bearings(problem_at_rest(problem.straightened())) if one_position(problem) else None
     if seen is None:
-        raise InvalidProblem("this formulation needs azimuths of one position", "formulation", 'use "nls"')
+        kinds = " and ".join(dict.fromkeys(block.kind for block in problem.rows))
+        raise InvalidProblem(
+            f"{formulation!r} needs azimuths of one position, and the rows here are {kinds}", "formulation", 'use "nls"'
+        )
     return seen
 
 
@@ -34,11 +37,13 @@ def pose_directions(problem: Problem, locate: Locate) -> ConicStatement:
     from formulations.conic import rank_ratio
     from formulations.direction_sdp import chordal_program, direction_problem, settings_of
 
-    seen = _seen(problem)
+    seen = _seen(problem, "direction_sdp")
     complete = complete_bearings(seen)
     if not complete:
         raise InvalidProblem(
-            "directions need an azimuth and an elevation of two stations or more in space", "formulation", 'use "nls"'
+            "'direction_sdp' needs an azimuth and an elevation of two stations or more in space",
+            "formulation",
+            'use "nls"',
         )
     data = chordal_program(**sights(seen, *complete[0]))
     count = len(data.station)
@@ -77,7 +82,7 @@ def pose_minimax(problem: Problem, locate: Locate) -> ConicStatement:
     """
     from formulations.minimax_cone import ball_data, ball_problem, minimax, settings_of
 
-    seen = _seen(problem)
+    seen = _seen(problem, "minimax_cone")
     cones = cones_of(seen, 0)
     found = None if cones is None else minimax(*cones)
     if found is None or cones is None or not np.isfinite(found.level):

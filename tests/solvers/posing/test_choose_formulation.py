@@ -106,6 +106,21 @@ def test_words_of_methods_stand_for_the_only_formulation_that_serves():
     assert pose(sighted(1), "directions").formulation == "direction_sdp"
 
 
+def test_unknown_names_get_short_advice():
+    problem = differences(1)
+    for name, what in (
+        ("hul", "did you mean 'hull'"),
+        ("lsr", "'lsr' is a stage of methods"),
+        ("auto", "'auto' is a method"),
+        ("gtrs", "'gtrs' stands for 'squared_range'"),
+        ("direction_sdp", "'direction_sdp' needs azimuths of one position, and the rows here are tdoa"),
+        ("minimax_cone", "'minimax_cone' needs azimuths"),
+    ):
+        with pytest.raises(InvalidProblem, match=what) as caught:
+            pose(problem, name)
+        assert len(str(caught.value)) < 200
+
+
 def test_what_cannot_be_posed_is_refused_by_a_sentence():
     problem = differences(1)
     with pytest.raises(InvalidProblem, match="2 problems are a batch"):

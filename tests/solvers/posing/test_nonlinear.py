@@ -115,6 +115,14 @@ def test_failed_solves_are_statuses():
     assert "your objective" in str(fix.reason)
 
 
+def test_an_objective_that_is_not_smooth_is_named():
+    posed = pose(differences(1), "nls")
+    posed.minimise(ca.norm_1(posed.residual))
+    fix = posed.solve(settings={"max_iter": 20})
+    assert fix.status == Status.NUMERICAL
+    assert "your objective is not smooth, because it contains fabs" in str(fix.reason)
+
+
 @pytest.mark.slow
 def test_a_long_run_is_posed_by_block_averages():
     bare = run(120, prior=200.0)

@@ -1,8 +1,10 @@
 """What both kinds of posed problems share: names, tables, and honest statuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from solvers.posing.scenes import ranged
+from solvers.posing.scenes import differences, ranged
 
 from optloc import Fix, InvalidProblem, Status, constraints, pose, solve
 
@@ -44,3 +46,83 @@ def test_its_text_names_the_formulation_and_the_changes(formulation):
     assert repr(posed) == f"<posed problem '{formulation}'>"
     posed.add(posed.position[0] <= 1e9, name="fence")
     assert repr(posed) == f"<posed problem '{formulation}' with constraint \"fence\">"
+
+
+def apart_from_solve(formulation, seeds):
+    """Problems with a far half-plane or disc in which a pose and `solve` differ: two for each seed.
+
+    At 3 to 13 times the size of the network, least squares from the posed point alone runs away from their faces.
+    """
+    apart = []
+    for seed in seeds:
+        for scene in (ranged, differences):
+            problem = scene(seed, scale=600.0)
+            rng = np.random.default_rng(seed)
+            angle, far = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(2e3, 8e3)
+            normal = np.array([np.cos(angle), np.sin(angle)])
+            half = rng.random() < 0.5
+            it = constraints.half_plane(normal, -far) if half else constraints.disc(-far * normal, 300.0)
+            expected = solve(replace(problem, constraints=it))
+            posed = pose(problem, formulation)
+            posed.add(it, name="far")
+            fix = posed.solve()
+            same = np.allclose(fix.position, expected.position, rtol=0.0, atol=1e-3, equal_nan=True)
+            if fix.status != expected.status or not same:
+                apart.append((seed, scene.__name__, fix.status, expected.status))
+    return apart
+
+
+# the seeds with the hardest solves
+@pytest.mark.parametrize("formulation", ["hull", "sdp", "nls"])
+def test_far_constraints_have_the_status_and_position_of_solve(formulation):
+    assert apart_from_solve(formulation, (1, 5, 7)) == []
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("formulation", ["hull", "sdp", "nls"])
+def test_many_far_constraints_have_the_status_and_position_of_solve(formulation):
+    assert apart_from_solve(formulation, range(15)) == []
+
+
+def test_a_far_linear_relation_is_contradictory():
+    problem = differences(1, scale=600.0)
+    posed = pose(problem, "hull")
+    posed.add(posed.position[0] <= -5000.0, name="far")
+    assert posed.solve().status == Status.CONTRADICTORY
+    posed.add(posed.position[0] >= 5000.0, name="east")
+    assert posed.solve().status == Status.INFEASIBLE
+
+
+def test_without_a_posed_solution_the_starts_of_solve_answer_and_the_reason_says_so():
+    problem = ranged(3)
+    free = solve(problem).position
+    posed = pose(problem, "hull")
+    posed.add(posed.position[0] <= free[0] - 5.0, name="west")
+    fix = posed.solve(settings={"max_iter": 1})
+    assert fix.position[0] == pytest.approx(free[0] - 5.0, abs=1e-5)
+    assert "the posed problem has no solution by CLARABEL" in str(fix.reason)
+    assert not fix.posed.refined
+    assert np.isnan(fix.posed.value)
+    assert posed.solve(settings={"max_iter": 1}, refine=False).status == Status.NUMERICAL
+
+
+@pytest.mark.parametrize("formulation", ["sdp", "hull", "nls"])
+def test_settings_and_starts_are_checked(formulation):
+    posed = pose(differences(1), formulation)
+    with pytest.raises(InvalidProblem, match=r"^settings: .* does not accept the settings? foo; check .*names.*\.$"):
+        posed.solve(settings={"foo": 1})
+    with pytest.raises(InvalidProblem, match=r"^start: start has 5 numbers, not 2"):
+        posed.solve(start=np.zeros(5))
+    with pytest.raises(InvalidProblem, match="no vector of numbers"):
+        posed.solve(start="here")
+    fix = posed.solve()
+    for start in (fix, fix.posed, fix.position, fix.x):
+        assert posed.solve(start=start).position == pytest.approx(fix.position, abs=1e-3)
+
+
+def test_an_unrefined_fix_says_what_refines_it_and_that_chi_square_is_not_computed():
+    posed = pose(ranged(2), "hull")
+    text = " ".join(str(posed.solve(refine=False)).split())
+    assert "for a pose use refine=True or a constraint of optloc.constraints" in text
+    assert "chi-square not computed: there is no refined answer" in text
+    assert "nothing to test" not in text

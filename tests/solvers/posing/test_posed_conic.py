@@ -136,6 +136,21 @@ def test_what_cannot_be_added_or_minimised():
         posed.solve("NOSUCH")
 
 
+def test_no_solver_denies_a_point_that_exists():
+    """Clarabel takes the large duals far from the data for a proof that no point exists."""
+    for seed in (1, 4, 7, 12):
+        problem = ranged(seed, scale=600.0)
+        rng = np.random.default_rng(seed)
+        angle, far = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(2e3, 8e3)
+        posed = pose(problem, "hull")
+        away = posed.position + far * np.array([np.cos(angle), np.sin(angle)])
+        posed.add(cp.norm(away) <= 300.0, name="far")
+        fix = posed.solve()
+        assert fix.status in (Status.NUMERICAL, Status.UNREFINED)
+        if fix.status == Status.NUMERICAL:
+            assert "but one does" in str(fix.reason)
+
+
 def test_failed_solves_are_statuses():
     problem = differences(1)
     posed = pose(problem, "hull")
