@@ -23,9 +23,10 @@ def with_wave(problem: TableProblem, wave: WaveOptions) -> TableProblem:
         For options that have no effect on the values of the table, and for a wave speed that is not understood.
     """
     depends = any(map(_depends_on_speed, problem.sections))
-    picks = any(line.startswith(_KEY) for line in problem.lines)
+    # speeds of P and S waves are a line of the file, or a medium of layers
+    picks = any(line.startswith(_KEY) for line in problem.lines) or "[medium]" in problem.after
     if wave.speed is not None and picks:
-        raise InvalidProblem("--vp and --vs determine the speed of S minus P", "--wave-speed", "remove this option")
+        raise InvalidProblem("--vp and --vs determine the speeds of P and S", "--wave-speed", "remove this option")
     if (wave.speed is not None or wave.wind is not None) and not depends:
         units = ", ".join(dict.fromkeys(section.unit for section in problem.sections))
         what = f"the values are in {units}, so the wave speed has no effect"
