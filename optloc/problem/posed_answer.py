@@ -29,8 +29,8 @@ class PosedAnswer:
         Objective at the solution: chi-square, unless you or the formulation replace it.
     bound : float
         Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound. It bounds
-        the cost of maximum likelihood for "moment_sdp" and "direction_sdp" only. The other formulations minimise other
-        residuals, for instance those of squared ranges.
+        the cost of maximum likelihood for "moment_sdp" (in its box) and "lifted" only. "direction_sdp" minimises chords
+        instead of angles, the other formulations for instance squared ranges. Their bounds may exceed that cost.
     rank_ratio : float
         Second over first eigenvalue of a lifted matrix, or distance from the relaxed surface; NaN if nothing is lifted.
         A value near zero means that the relaxation is exact.
