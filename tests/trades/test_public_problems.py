@@ -224,8 +224,8 @@ def test_s_minus_p_times_of_an_earthquake(tmp_path, monkeypatch):
     """Earthquakes: Saint Louis University, eas.slu.edu/Outreach/eqexercise.html: S minus P of 10, 25 and 38 s.
 
     The page multiplies by 8 km/s, which are P waves of 5.84 km/s and S waves of 3.37 km/s by its ratio of 1.37. The
-    positions of the stations are approximate, to a kilometre or so. A focus at the surface near Jonesboro, Arkansas, fits the
-    whole seconds.
+    positions of the stations are approximate, to a kilometre or so. A focus at the surface near Jonesboro, Arkansas,
+    fits the whole seconds.
     """
     monkeypatch.chdir(tmp_path)
     rows = [("MPH", 35.12, -89.93), ("UALR", 34.78, -92.34), ("SLM", 38.64, -90.24)]
