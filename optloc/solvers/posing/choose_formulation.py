@@ -41,7 +41,7 @@ def pose(problem: Problem, formulation: str) -> Posed:
     entry = FORMULATIONS[name]
     if entry.pose is None:
         twin = entry.twin or "nls"
-        known = f"{formulation!r} stands for {name!r}, which" if formulation != name else f"{name!r}"
+        known = f"{formulation!r} means {name!r}, which" if formulation != name else f"{name!r}"
         raise InvalidProblem(f"{known} is a closed form and no optimisation problem", "formulation", f"pose {twin!r}")
     if not entry.serves(one) and entry.starts:
         raise InvalidProblem(

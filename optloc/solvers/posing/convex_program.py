@@ -236,7 +236,7 @@ class ConvexProgram:
         if report.outcome == "infeasible":
             without = solve_problem(cp.Problem(cp.Minimize(0.0), self.program.constraints), "CLARABEL", settings)
             if without.outcome in ("solved", "inaccurate") and self._is_met():
-                text = "it reports that no point meets the constraints, but one does; the solution is far from the data"
+                text = "it finds no point within the constraints, but there is a point; the solution is far from the data"
                 report = replace(report, outcome="failed", message=text)
         # no value of an attempt that failed remains
         for one in self.program.variables():
@@ -247,7 +247,7 @@ class ConvexProgram:
         """Return whether the values of the variables meet the constraints, each in its unit of order one.
 
         A constraint of the position alone never contradicts a relaxation. The rules of the relaxation itself are tested
-        only beside other relations, since far from the data their numbers are large.
+        only together with other relations, since far from the data their numbers are large.
         """
         free = any(one.free for one in self.relations.values())
         rules = self.program.constraints if free else [part for one in self.relations.values() for part in one.parts]

@@ -481,7 +481,7 @@ class PosedProgram(Posed):
             return ""
         return (
             f"your objective is not smooth, because it contains {' and '.join(kinks)}: pose it in a convex "
-            "formulation, or use a smooth one such as sqrt(1 + residual**2)"
+            "formulation, or use a smooth function such as sqrt(1 + residual**2)"
         )
 
     def _explain_failure(self, found: Local, answer: PosedAnswer) -> Fix:

@@ -324,7 +324,7 @@ def numbers_of_start(start: Any, sizes: Sequence[int]) -> Array:
     start : Fix or array
         An earlier fix, or numbers.
     sizes : sequence of int
-        Valid lengths, the one of a whole vector first.
+        Valid lengths; the length of a whole vector is first.
     """
     advice = "give a fix, a vector or a position"
     try:

@@ -112,7 +112,7 @@ def test_unknown_names_get_short_advice():
         ("hul", "did you mean 'hull'"),
         ("lsr", "'lsr' is a stage of methods"),
         ("auto", "'auto' is a method"),
-        ("gtrs", "'gtrs' stands for 'squared_range'"),
+        ("gtrs", "'gtrs' means 'squared_range'"),
         ("direction_sdp", "'direction_sdp' needs azimuths of one position, and the rows here are tdoa"),
         ("minimax_cone", "'minimax_cone' needs azimuths"),
     ):

@@ -148,7 +148,7 @@ def test_no_solver_denies_a_point_that_exists():
         fix = posed.solve()
         assert fix.status in (Status.NUMERICAL, Status.UNREFINED)
         if fix.status == Status.NUMERICAL:
-            assert "but one does" in str(fix.reason)
+            assert "but there is a point" in str(fix.reason)
 
 
 def test_failed_solves_are_statuses():
