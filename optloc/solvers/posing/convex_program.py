@@ -236,7 +236,7 @@ class ConvexProgram:
         if report.outcome == "infeasible":
             without = solve_problem(cp.Problem(cp.Minimize(0.0), self.program.constraints), "CLARABEL", settings)
             if without.outcome in ("solved", "inaccurate") and self._is_met():
-                text = "it finds no point within the constraints, but there is a point; the solution is far from the data"
+                text = "it finds no point within the constraints, but there is a point; it is far from the data"
                 report = replace(report, outcome="failed", message=text)
         # no value of an attempt that failed remains
         for one in self.program.variables():
