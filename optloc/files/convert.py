@@ -27,6 +27,7 @@ from optloc.files.crust import crust_of
 from optloc.files.csv_formats import read_table
 from optloc.files.declination import declination_of
 from optloc.files.headings import stations_turned
+from optloc.files.lone_columns import text_columns
 from optloc.files.measurements import ESTIMATE
 from optloc.files.picks import phase_sigmas, waves_of
 from optloc.files.pseudoranges import is_gnss
@@ -214,6 +215,7 @@ def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
         if len(chosen) > 1 and not _is_long(roles, hints, stations):
             roles = Roles.of(table, stated_columns, [one.column for one in chosen]).without_stations()
             return _plan(roles, hints, stations, source, read_wide(roles, hints, chosen, stations), named)
+        roles = _with_station(roles, stations)
     roles = as_angles(roles, hints)
     sorts, receivers = sorts_of(roles, hints), None
     if not sorts:
@@ -265,6 +267,23 @@ def _is_long(roles: Roles, hints: ColumnHints, stations: ColumnPlaces) -> bool:
         return False
     # If receivers have columns of readings, a time column is the time of these readings, not a reading.
     return bool({*sorts_of(roles, hints)} - {"times"})
+
+
+def _with_station(roles: Roles, stations: ColumnPlaces) -> Roles:
+    """Return roles in which the only column of station names is the station, if no word identifies a column.
+
+    The second station of a row, if its column has a known name, is no choice for the first.
+    """
+    if roles.find("station") is not None:
+        return roles
+    taken = {part for role in roles.stated for part in roles.by_role[role].split("+")}
+    taken |= {roles.by_role[role] for role in ("reference", "transmitter") if role in roles.by_role}
+    found = [name for name in text_columns(roles.table, taken) if holds_names(roles.table, name, stations.names)]
+    if len(found) != 1 or role_of(found[0]) is not None:
+        return roles
+    note = f"the column {found[0]!r} has the station of each row: no other column fits"
+    table = replace(roles.table, notes=(*roles.table.notes, note))
+    return replace(roles, table=table, by_role={**roles.by_role, "station": found[0]})
 
 
 def _with_transmitters(roles: Roles, forms: Sequence[Form], stations: ColumnPlaces) -> Roles:

@@ -17,8 +17,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
-from optloc.files.columns import any_unit, check_unit, rank, role_named, role_of, stem, unit_of
+from optloc.files.columns import PLACE, any_unit, check_unit, rank, role_named, role_of, stem, unit_of
 from optloc.files.csv_formats import read_table, records
+from optloc.files.lone_columns import names_stations
 from optloc.files.schema import MeasurementsTable, ProblemFile
 from optloc.files.settings import join
 from optloc.files.table import Table
@@ -328,7 +329,7 @@ class ColumnPlaces:
     """Stations of a table.
 
     columns: columns of a stations table (s,), such as name, x, y, z or name, lat_deg, lon_deg, height. frame:
-    "cartesian", "ecef" or "geodetic". unit: unit of lengths. note: assumption about the heights, or empty.
+    "cartesian", "ecef" or "geodetic". unit: unit of lengths. note: assumptions about names and heights, or empty.
     """
 
     columns: Mapping[str, Array]
@@ -353,7 +354,8 @@ def places_of(path: Path, stated: Mapping[str, str], frame: str | None) -> Colum
         roles = Roles.of(records(data, path.name), stated)
     else:
         roles = Roles.of(read_table(path), stated)
-    found = placed(roles, frame)
+    roles, note = _with_names(roles)
+    found = _noted(placed(roles, frame), note)
     column = roles.find("heading")
     if column is not None:
         factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
@@ -361,6 +363,22 @@ def places_of(path: Path, stated: Mapping[str, str], frame: str | None) -> Colum
         found = replace(found, columns={**found.columns, **headings})
     check_column_hints(roles, ("name", "heading", *place_roles(roles)))
     return found
+
+
+def _with_names(roles: Roles) -> tuple[Roles, str]:
+    """Return roles with a column of station names, and a note if no word but only its cells identify this column."""
+    taken = {part for role in (*roles.stated, *PLACE) for part in roles.by_role.get(role, "").split("+")}
+    column = names_stations(roles.table, taken) if roles.find("name") is None else None
+    if column is None:
+        return roles, ""
+    kept = {role: name for role, name in roles.by_role.items() if name != column}
+    note = f"the column {column!r} of {roles.table.source} has the names of the stations: no other column fits"
+    return replace(roles, by_role={**kept, "name": column}), note
+
+
+def _noted(stations: ColumnPlaces, note: str) -> ColumnPlaces:
+    """Return stations with one more note, which may be empty."""
+    return replace(stations, note="; ".join(text for text in (stations.note, note) if text))
 
 
 def place_roles(roles: Roles) -> tuple[str, ...]:
@@ -411,7 +429,7 @@ def in_space(stations: ColumnPlaces) -> ColumnPlaces:
     if stations.frame == "geodetic" or "z" in stations.columns:
         return stations
     flat = {"z": np.zeros(len(stations.names))}
-    return replace(stations, columns={**stations.columns, **flat}, note=_NO_HEIGHTS.replace("height 0", "z = 0"))
+    return _noted(replace(stations, columns={**stations.columns, **flat}), _NO_HEIGHTS.replace("height 0", "z = 0"))
 
 
 def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:

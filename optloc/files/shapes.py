@@ -20,6 +20,7 @@ from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, is_dated, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
+from optloc.files.lone_columns import without_difference
 from optloc.files.picks import differences, read_picks
 from optloc.files.repeated_readings import without_repeats
 from optloc.files.roles import ColumnPlaces, Roles, placed
@@ -252,9 +253,10 @@ def read_long(
     if not len(pick):
         raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
     a = roles.labels("station") if receivers is None else receivers
-    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, hints)
     found = _of_column(form, unit, cells, column, a)
-    found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
+    hints, why = _with_reference(found, roles, hints, stations)
+    positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, hints)
+    found = replace(found, b=None if b is None else b[pick], notes=tuple(text for text in (note, why) if text))
     if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
     return _checked(found, roles, hints, stations, table.count - len(pick), positive)
@@ -277,6 +279,23 @@ def _of_column(form: Form, unit: str, cells: NumberColumn, column: str, a: Array
     `cells` are its numbers, in `unit`. `a` has the station of each row of the table.
     """
     return Readings(form, unit, cells.values, cells.row, (column,), np.zeros(len(cells.row), dtype=int), a[cells.row])
+
+
+def _with_reference(
+    found: Readings, roles: Roles, hints: ColumnHints, stations: ColumnPlaces
+) -> tuple[ColumnHints, str]:
+    """Return options with the only station without a difference as reference, and a note; unchanged if they state one.
+
+    The stations need a table of their own: the rows of differences alone need not contain the reference.
+    """
+    lacking = hints.reference is None and roles.find("reference") is None and hints.stations is not None
+    if found.form.stations == 1 or found.form.kind == "range_sum" or not lacking:
+        return hints, ""
+    name = without_difference(stations.names, found.a, found.values.units != 0)
+    # A zero is the difference of the reference to itself for differences of times or lengths alone.
+    if name is None or (found.form.kind != "tdoa" and name in found.a.tolist()):
+        return hints, ""
+    return replace(hints, reference=name), f"the reference is {name}: it is the only station without a difference"
 
 
 def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array]:
