@@ -1,6 +1,6 @@
 """Columns and stations that only one choice fits: the names of stations, and the reference of differences.
 
-Tables often name stations by a word of their own, such as the file of a recorder. These functions return a choice only
+Tables often name stations by unusual words, such as the file of a recorder. These functions return a choice only
 if it is the only one, and otherwise None; the caller then raises an error.
 """
 

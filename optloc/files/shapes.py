@@ -286,7 +286,7 @@ def _with_reference(
 ) -> tuple[ColumnHints, str]:
     """Return options with the only station without a difference as reference, and a note; unchanged if they state one.
 
-    The stations need a table of their own: the rows of differences alone need not contain the reference.
+    The stations need a separate table: the rows of differences alone may lack the reference.
     """
     lacking = hints.reference is None and roles.find("reference") is None and hints.stations is not None
     if found.form.stations == 1 or found.form.kind == "range_sum" or not lacking:

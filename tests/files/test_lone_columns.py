@@ -126,6 +126,12 @@ def test_a_known_word_precedes_the_cells(tmp_path):
     assert table_of(tmp_path, stations, rows).read().problem.stations.names == tuple("ABCDEF")
 
 
+def test_options_decide_between_two_columns(tmp_path):
+    stations, rows = with_column(RECORDERS, "pole", "abcdef"), with_column(TIMES, "heard", FILES[1:])
+    found = table_of(tmp_path, stations, rows, columns=STATED["columns"])
+    assert found.read().problem.z.tolist() == table_of(tmp_path, RECORDERS, TIMES).read().problem.z.tolist()
+
+
 def test_a_table_of_stations_alone_has_its_names_by_their_cells(tmp_path):
     (tmp_path / "s.csv").write_text(RECORDERS)
     found = convert(tmp_path / "s.csv", tmp_path / "out.csv", ColumnHints(what="stations"))
