@@ -65,7 +65,7 @@ class Terrain:
             raise InvalidProblem(what, "height", "give one height for each x (first axis) and y (second axis)")
         if not np.isfinite(self.height).all():
             count = int((~np.isfinite(self.height)).sum())
-            raise InvalidProblem(f"{count} heights are not finite", "height", "fill the gaps of the grid first")
+            raise InvalidProblem(f"heights without a finite number: {count}", "height", "fill the gaps of the grid first")
 
     @cached_property
     def digest(self) -> str:

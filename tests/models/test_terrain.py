@@ -60,7 +60,7 @@ def test_what_is_neither_number_nor_symbol_is_refused():
 BAD = {
     "an axis of one": (([0.0], [0.0, 1.0], [[0.0, 1.0]]), "the axis has shape"),
     "a descending axis": (([1.0, 0.0], [0.0, 1.0], np.eye(2)), "is not ascending"),
-    "a gap": (([0.0, 1.0], [0.0, 1.0], [[0.0, np.nan], [1.0, 2.0]]), "1 heights are not finite"),
+    "a gap": (([0.0, 1.0], [0.0, 1.0], [[0.0, np.nan], [1.0, 2.0]]), "heights without a finite number: 1"),
     "a transposed grid": (([0.0, 1.0, 2.0], [0.0, 1.0], np.zeros((2, 3))), "for a grid of 3 by 2 points"),
     "words": ((["a", "b"], [0.0, 1.0], np.eye(2)), "not all entries are numbers"),
 }
