@@ -64,8 +64,8 @@ class Terrain:
             what = f"heights of shape {self.height.shape} for a grid of {shape[0]} by {shape[1]} points"
             raise InvalidProblem(what, "height", "give one height for each x (first axis) and y (second axis)")
         if not np.isfinite(self.height).all():
-            count = int((~np.isfinite(self.height)).sum())
-            raise InvalidProblem(f"heights without a finite number: {count}", "height", "fill the gaps of the grid first")
+            what = f"heights without a finite number: {int((~np.isfinite(self.height)).sum())}"
+            raise InvalidProblem(what, "height", "fill the gaps of the grid first")
 
     @cached_property
     def digest(self) -> str:
