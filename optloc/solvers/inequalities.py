@@ -498,14 +498,28 @@ def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: A
 
     `inside` (N,) is the least cost of a minimum on no face. `sides` is the list of all faces, and `face` (N, q) the
     index of the face of each minimum. The cheapest of all minima is always a minimum of the admitted positions. If a
-    descent missed it, the best minimum found is kept.
+    descent missed it, the cheapest minimum found is kept alone.
     """
     minimal = np.zeros(cost.shape, dtype=bool)
     for number in range(1, len(sides)):
         item, slot = np.nonzero(np.isfinite(cost) & (face == number))
         minimal[item, slot] = is_minimum(problem.take(item), sides[number], x[item, slot])
     least = np.minimum(np.where(minimal, cost, np.inf).min(1), inside)
-    return np.asarray(~minimal & (cost >= least[:, None]))
+    cheapest = np.minimum(cost.min(1, initial=np.inf), inside)
+    return np.asarray(~minimal & ((cost >= least[:, None]) | (cost > cheapest[:, None])))
+
+
+def without_falling(problem: Problem, pool: Pool) -> Pool:
+    """Return a pool in which minima on faces from which the cost falls inwards are infeasible; the cheapest stays.
+
+    A new minimum may show that the cheapest minimum before it is none. A pool of a robust loss is unchanged.
+    """
+    if pool.loss:
+        return pool
+    on_face = pool.face > 0
+    inside = np.where((pool.code == Status.OK) & ~on_face, pool.cost, np.inf).min(1, initial=np.inf)
+    cost = np.where(on_face, pool.cost, np.inf)
+    return _mark_infeasible(pool, on_face & _falls(problem, faces(problem), inside, pool.x, cost, pool.face))
 
 
 # Sentences about hidden minima.
@@ -584,8 +598,3 @@ def _below(problem: Problem, x: Array, item: int) -> str:
     names = [problem.stations.names[station] for station in found]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f"{', '.join(names[:_NAMED])}{more}"
-
-
-def least_finished(pool: Pool) -> Array:
-    """Return the least cost (N,) of the finished candidates; infinite without one."""
-    return np.asarray(np.where(pool.code == Status.OK, pool.cost, np.inf).min(1, initial=np.inf))

@@ -409,3 +409,8 @@ def _sum_stages(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
     return tuple(
         Stage(stage.name, f"{stage.detail} (one of {len(parts)} parts)", seconds[i]) for i, stage in enumerate(longest)
     )
+
+
+def least_finished(pool: Pool) -> Array:
+    """Return the least cost (N,) of the finished candidates; infinite without one."""
+    return np.asarray(np.where(pool.code == Status.OK, pool.cost, np.inf).min(1, initial=np.inf))

@@ -30,10 +30,10 @@ from optloc.proof.scope import is_scaled, why_unsupported
 from optloc.solvers.around import starts_on_equalities
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
-from optloc.solvers.inequalities import bound_pool, is_hidden, least_finished
+from optloc.solvers.inequalities import bound_pool, is_hidden
 from optloc.solvers.layered import equations_in_layers, in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_SUSPECT
-from optloc.solvers.pool import Pool, chunk_size, in_parts, offer, pack
+from optloc.solvers.pool import Pool, chunk_size, in_parts, least_finished, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.orientation import headings, oriented_starts, unwind

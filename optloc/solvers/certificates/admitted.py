@@ -68,7 +68,7 @@ from optloc.solvers.certificates.position_cost import (
     state_columns,
     surfaces_of,
 )
-from optloc.solvers.inequalities import is_minimum
+from optloc.solvers.inequalities import is_minimum, without_falling
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, in_parts, noting_place, offer, pack
@@ -215,7 +215,7 @@ def _with_minima(problem: Problem, pool: Pool, minima: Minima) -> Pool:
         face=join(pool.face, face),
     )
     stage = Stage("certify", f"{int(filled.sum())} minima along edges", 0.0)
-    return keep_evidence(settle(problem, both, stage), pool)
+    return keep_evidence(settle(problem, without_falling(problem, both), stage), pool)
 
 
 def _prove_within(problem: Problem, pool: Pool, fix: Fix, margin: float, effort: float) -> tuple[Claims, Minima]:

@@ -20,9 +20,9 @@ from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import bound_pool, least_finished
+from optloc.solvers.inequalities import bound_pool
 from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
-from optloc.solvers.pool import Pool, chunk_size, in_parts, pack
+from optloc.solvers.pool import Pool, chunk_size, in_parts, least_finished, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
 from optloc.solvers.robust.statement import check_minima

@@ -21,6 +21,11 @@ def test_a_random_problem_has_the_best_admitted_fix(name, verdict):
     assert verdict(name, 1)[0] == ""
 
 
+@pytest.mark.parametrize("seed", few([353, 345], 1))
+def test_no_alternative_falls_inwards_after_a_proof_found_the_minimum(seed):
+    assert judge.verdict("polyhedron in space", seed)[0] == ""
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("name", "verdict"), CASES, ids=NAMES)
 def test_no_optimum_of_three_hundred_is_missed(name, verdict):
