@@ -512,7 +512,7 @@ def _falls(problem: Problem, sides: list[Face], inside: Array, x: Array, cost: A
 def without_falling(problem: Problem, pool: Pool) -> Pool:
     """Return a pool in which minima on faces from which the cost falls inwards are infeasible; the cheapest stays.
 
-    A new minimum may show that the cheapest minimum before it is none. A pool of a robust loss is unchanged.
+    A new minimum may show that the cheapest point before is no minimum. A pool of a robust loss is unchanged.
     """
     if pool.loss:
         return pool
