@@ -50,6 +50,7 @@ from optloc.cli.options import (
     TrueVelocity,
     Verbose,
     allowed,
+    choice,
     constraints,
     example,
     find_problem,
@@ -62,7 +63,6 @@ from optloc.cli.options import (
 
 app = typer.Typer(
     cls=CommandGroup,
-    no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,  # an internal error of optloc prints the whole traceback
     help="Position fixes from time, gain, angle and Doppler measurements, with covariance and status.",
@@ -357,7 +357,7 @@ def crlb(
 def check(
     file: ProblemPath,
     as_json: Json = False,
-    by: Annotated[str, typer.Option(metavar="station|pair|kind", help="Groups of the health table.")] = "station",
+    by: Annotated[str, choice("station|pair|kind", "Groups of the health table.", "--by")] = "station",
     method: Annotated[
         str | None, typer.Option("--method", "-m", help="Method of the fixes; choose a method that resists outliers.")
     ] = None,

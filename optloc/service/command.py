@@ -30,6 +30,7 @@ from optloc.cli import (
     Quiet,
     Verbose,
     WaveSpeed,
+    choice,
     example,
 )
 from optloc.files import claim, visible
@@ -55,10 +56,10 @@ Speed = Annotated[
     typer.Option(metavar="N", help="Replay speed relative to the recording; by default as fast as possible."),
 ]
 Wait = Annotated[str, typer.Option(metavar="TIME", help="Time from the first row of an event to its closing.")]
-Late = Annotated[str, typer.Option(metavar="drop|revise", help="Ignore late rows, or answer again.")]
+Late = Annotated[str, choice("drop|revise", "Ignore late rows, or answer again.", "--late")]
 Phases = Annotated[
     str,
-    typer.Option(metavar="two|one|fix", help="Answers: a fix at once and its proof later, both in one, or no proof."),
+    choice("two|one|fix", "Answers: a fix at once and its proof later, both in one, or no proof.", "--phases"),
 ]
 Deadline = Annotated[
     str | None,
@@ -95,7 +96,7 @@ Zmq = Annotated[
 ]
 Adapt = Annotated[
     str | None,
-    typer.Option("--adapter", metavar="chirpstack|mode-s", help="Format of the input lines from other systems."),
+    choice("chirpstack|mode-s", "Format of the input lines from other systems.", "--adapter"),
 ]
 
 Model = Annotated[
