@@ -14,28 +14,6 @@ Locate = Callable[[Problem], Fix]
 """Maps a problem to its fix by the method "auto", for formulations that are posed around a fix."""
 
 
-@dataclass(frozen=True, slots=True)
-class Relation:
-    """A named constraint of a posed problem, one entry for each scalar relation ``left - right <= 0`` or ``== 0``.
-
-    Parameters
-    ----------
-    name : str
-        Name for duals and messages.
-    parts : tuple
-        Relations in the language of the back end, normalised.
-    divisor : tuple of array
-        For each part, the numbers in SI units by which it is divided.
-    free : bool
-        Whether it holds in the posed problem only; else it is a constraint of the `Problem` too.
-    """
-
-    name: str
-    parts: tuple[Any, ...]
-    divisor: tuple[Array, ...]
-    free: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConicStatement:
     """A convex formulation of one problem.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import begin, in_parts, noting_place, pack
-from optloc.solvers.posing.convex_statement import Relation
+from optloc.solvers.posing.posed_problem import EXAMPLE, PosedProblem, Relation, StatedProgram
 from optloc.solvers.solution import with_sources
 from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 
@@ -28,7 +28,19 @@ _REFINEMENT = Method(("lsr", "certify"))
 _CONSTRAINED = "auto"
 
 
-class Posed(ABC):
+@dataclass(frozen=True, slots=True)
+class SolveRequest:
+    """The arguments of `Posed.solve`; `warm` is its argument `warm_start` or the default of this argument."""
+
+    solver: str | None
+    settings: Mapping[str, Any]
+    start: Any
+    duals: Mapping[str, float | Array] | None
+    warm: bool
+    refine: bool | None
+
+
+class Posed(PosedProblem, ABC):
     """An optimisation problem that a formulation poses, to read, to change and to solve.
 
     Parameters
@@ -37,24 +49,17 @@ class Posed(ABC):
         Flat batch of one problem.
     formulation : str
         Name of the formulation.
-
-    Attributes
-    ----------
-    problem
-        The optimisation problem: a ``cvxpy.Problem`` whose parameters have values, or for a nonlinear program a
-        dictionary of ``casadi.SX`` with the keys x, f, g and p.
+    program : StatedProgram
+        Its optimisation problem, without the constraints of `stated`.
     origin, unit
         Scaled coordinates are ``(x - origin) / unit``, metres.
     """
 
-    problem: Any
-    origin: Array
-    unit: float
-
-    def __init__(self, stated: Problem, formulation: str) -> None:
-        self.stated, self.formulation = stated, formulation
-        self.relations: dict[str, Relation] = {}
-        self.own_objective = False
+    def __init__(self, stated: Problem, formulation: str, program: StatedProgram, origin: Array, unit: float) -> None:
+        super().__init__(program)
+        self.stated, self.formulation, self.origin, self.unit = stated, formulation, origin, unit
+        # the alternatives of each union, one of which is among the relations
+        self._unions: dict[str, list[Relation]] = {}
 
     def __repr__(self) -> str:
         """Return the name of the formulation, and the changes, as text."""
@@ -147,14 +152,14 @@ class Posed(ABC):
             return
         if isinstance(constraint, bool | np.bool_):
             raise InvalidProblem(
-                "the relation has no unknown of this problem", "constraint", "use posed.position or posed.of(name)"
+                "the relation has no unknown of this problem", "constraint", f"use expressions as in {EXAMPLE}"
             )
         free = self._new_name(name)
         planes = self._as_planes(constraint, free)
         if planes:
             self._add_table(planes, free)
         else:
-            self._put(self._relation(constraint, free))
+            self._put(self._program.relation(constraint, free))
 
     def _add_table(self, members: Sequence[Any], name: str | None) -> None:
         """Add constraints of the table to the `Problem` and to the posed problem; all get `name` if it is given."""
@@ -169,40 +174,29 @@ class Posed(ABC):
         check_constraints(stated)
         found: dict[str, list[Relation]] = {}
         for label, one in named:
-            found.setdefault(label, []).append(self._table_relation(one, label))
+            found[label] = _together(found.get(label), self._table_relations(one, label))
         self.stated = stated
-        for label, several in found.items():
-            parts = tuple(part for one in several for part in one.parts)
-            self._put(Relation(label, parts, tuple(d for one in several for d in one.divisor), free=False))
+        for alternatives in found.values():
+            self._put_one_of(alternatives)
 
-    def _new_name(self, name: str | None) -> str:
-        """Return a name for a constraint; raise InvalidProblem if it is in use."""
-        if name is None:
-            name = next(
-                text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
-            )
-        if not isinstance(name, str):
-            raise InvalidProblem(f"the name {name!r} is no text", "name", "give a text such as 'fence'")
-        if name in self.relations:
-            raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
-        return name
+    def _take_over(self) -> None:
+        """Add the constraints of the problem; a constraint that the back end cannot state stays with the refinement."""
+        for one in self.stated.constraints:
+            before = self.relations.get(one.name)
+            alone = before is not None and (one.name in self._unions or not is_conjunctive(one))
+            label = self._counted(one.name, 2) if alone else one.name
+            try:
+                alternatives = self._table_relations(one, label)
+            except InvalidProblem:
+                continue
+            self._put_one_of(alternatives if before is None or alone else _together([before], alternatives))
 
-    def _put(self, relation: Relation) -> None:
-        """Store a relation and state the problem with it."""
-        self.relations[relation.name] = relation
-        self._restate()
+    def _put_one_of(self, alternatives: Sequence[Relation]) -> None:
+        """State the problem with the first of the alternatives of a constraint, and keep the others for the solve."""
+        if len(alternatives) > 1:
+            self._unions[alternatives[0].name] = list(alternatives)
+        self._put(alternatives[0])
 
-    @abstractmethod
-    def minimise(self, expression: Any) -> None:
-        """Replace the objective by an expression of your own, in your unit.
-
-        Raises
-        ------
-        InvalidProblem
-            If it is not a scalar, has no unknown of this problem, or is not convex in a convex formulation.
-        """
-
-    @abstractmethod
     def solve(
         self,
         solver: str | None = None,
@@ -239,22 +233,26 @@ class Posed(ABC):
             With constraints that hold for the fix too, the solution and the starts of `optloc.solve` compete in the
             refinement. If the back end finds no solution then, the reason says so, and the starts alone are refined.
         """
+        warm = (start is not None or duals is not None) if warm_start is None else warm_start
+        return self._solve(SolveRequest(solver, settings or {}, start, duals, warm, refine))
+
+    @abstractmethod
+    def _solve(self, request: SolveRequest) -> Fix:
+        """Return the judged fix; see `solve`."""
 
     @abstractmethod
     def _as_planes(self, constraint: Any, name: str) -> list[Band]:
         """Return planes that a linear relation of the position alone states; empty for any other relation."""
 
     @abstractmethod
-    def _relation(self, constraint: Any, name: str) -> Relation:
-        """Return a relation of the back end's language, divided by its own unit."""
+    def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
+        """Return a constraint of the table in the back end's language: alternatives, one of which holds.
 
-    @abstractmethod
-    def _table_relation(self, constraint: Any, name: str) -> Relation:
-        """Return a constraint of the table in the back end's language."""
-
-    @abstractmethod
-    def _restate(self) -> None:
-        """Rewrite `problem` after a change."""
+        Raises
+        ------
+        InvalidProblem
+            If the back end cannot state it.
+        """
 
     # The fix.
 
@@ -310,6 +308,11 @@ class Posed(ABC):
         what += ["your objective"] if self.own_objective else []
         return f" with {' and '.join(what)}" if what else ""
 
+    def _unbounded(self, answer: PosedAnswer) -> Fix:
+        """Return the fix of an objective without a least value."""
+        what = "your objective" if self.own_objective else "the objective"
+        return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
+
     def _failed(self, code: Status, reason: str, answer: PosedAnswer) -> Fix:
         """Return a fix without an answer."""
         fix = replace(with_sources(self.stated, failed_fixes(self.stated, reason)).reshape(()), marks=None)
@@ -344,6 +347,17 @@ def _table_members(constraint: Any) -> list[Constraint] | None:
     if isinstance(constraint, tuple | list) and constraint and all(isinstance(one, kinds) for one in constraint):
         return list(constraint)
     return None
+
+
+def _together(before: Sequence[Relation] | None, more: list[Relation]) -> list[Relation]:
+    """Return the alternatives `more` of a constraint, after a constraint of the same name, as one constraint.
+
+    Both constraints have one alternative each if there is a constraint before.
+    """
+    if before is None:
+        return more
+    (first,), (second,) = before, more
+    return [replace(first, parts=(*first.parts, *second.parts), divisor=(*first.divisor, *second.divisor))]
 
 
 def _quoted(names: Iterable[str]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
-from optloc.solvers.posing.convex_statement import ConicStatement, Relation
-from optloc.solvers.posing.posed import Posed, numbers_of_start
+from optloc.solvers.posing.convex_statement import ConicStatement
+from optloc.solvers.posing.posed import Posed, SolveRequest, numbers_of_start
+from optloc.solvers.posing.posed_problem import Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
@@ -36,26 +36,10 @@ class PosedConic(Posed):
     """
 
     def __init__(self, stated: Problem, formulation: str, statement: ConicStatement) -> None:
-        super().__init__(stated, formulation)
-        self.statement, self.origin, self.unit = statement, statement.origin, statement.unit
+        self.statement = statement
         self._convex = ConvexProgram(statement.program, statement.size, statement.constant, statement.settings)
-        self.relations = self._convex.relations
-        self._restate()
-        for constraint in stated.constraints:
-            self._take_over(constraint)
-
-    def _take_over(self, constraint: Any) -> None:
-        """Add a constraint of the problem to the relaxation; one that is not convex stays with the refinement."""
-        try:
-            relation = self._table_relation(constraint, constraint.name)
-        except InvalidProblem:
-            return
-        before = self.relations.get(constraint.name)
-        if before is not None:
-            relation = replace(
-                before, parts=(*before.parts, *relation.parts), divisor=(*before.divisor, *relation.divisor)
-            )
-        self._put(relation)
+        super().__init__(stated, formulation, self._convex, statement.origin, statement.unit)
+        self._take_over()
 
     # Parts.
 
@@ -83,21 +67,6 @@ class PosedConic(Posed):
         return self.statement.residual
 
     # Changes.
-
-    def minimise(self, expression: Any) -> None:
-        """Replace the objective by a convex expression of your own; see `Posed.minimise`."""
-        self._convex.minimise(expression)
-        self._convex.settings, self.own_objective = {}, True
-        self._restate()
-
-    def _restate(self) -> None:
-        """Rewrite `problem` after a change."""
-        self._convex.restate()
-        self.problem = self._convex.problem
-
-    def _relation(self, constraint: Any, name: str) -> Relation:
-        """Return a relation of cvxpy, divided by its own unit."""
-        return self._convex.relation(constraint, name)
 
     def _as_planes(self, constraint: Any, name: str) -> list[Band]:
         """Return planes that a linear relation of the position alone states; empty for any other relation."""
@@ -129,7 +98,7 @@ class PosedConic(Posed):
             for low, up, direction in zip(lower, offset / length, normal / length[:, None], strict=True)
         ]
 
-    def _table_relation(self, constraint: Any, name: str) -> Relation:
+    def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
         """Return a constraint of the table as relations of cvxpy, divided by the unit of length."""
         import cvxpy as cp
 
@@ -141,44 +110,29 @@ class PosedConic(Posed):
             else:
                 away = (position[: len(one.centre)] - one.centre) / self.unit
                 parts.append(cp.norm(away) <= one.radius / self.unit)
-        return Relation(name, tuple(parts), tuple(np.array(self.unit) for _ in parts), free=False)
+        return [Relation(name, tuple(parts), tuple(np.array(self.unit) for _ in parts), free=False)]
 
     # The solution.
 
-    def solve(
-        self,
-        solver: str | None = None,
-        settings: Mapping[str, Any] | None = None,
-        *,
-        start: Any = None,
-        duals: Mapping[str, float | Array] | None = None,
-        warm_start: bool | None = None,
-        refine: bool | None = None,
-    ) -> Fix:
-        """Return the judged fix of the posed problem; see `Posed.solve`."""
-        warm = (start is not None or duals is not None) if warm_start is None else warm_start
-        earlier = getattr(start, "posed", start)
-        if not (start is None or isinstance(earlier, PosedAnswer)):
+    def _solve(self, request: SolveRequest) -> Fix:
+        """Return the judged fix; see `Posed.solve`."""
+        earlier = getattr(request.start, "posed", request.start)
+        if not (request.start is None or isinstance(earlier, PosedAnswer)):
             layout = self.stated.layout
-            numbers_of_start(start, (layout.size, layout.n_shared, self.stated.dimension))
+            numbers_of_start(request.start, (layout.size, layout.n_shared, self.stated.dimension))
         first = earlier.variables if isinstance(earlier, PosedAnswer) else None
-        report = self._convex.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=first)
-        solved = self._convex.has_solution(report)
-        own_duals, values, cost = self._convex.results(solved=solved)
+        found = self._convex.solution(request.solver, request.settings, warm=request.warm, start=first)
+        solved = self._convex.has_solution(found.backend)
         answer = PosedAnswer(
-            self.formulation,
-            own_duals,
-            values,
-            report,
-            cost,
-            self._convex.bound() if solved else np.nan,
-            self.statement.rank_ratio() if solved else np.nan,
+            **found.by_name(),
+            formulation=self.formulation,
+            rank_ratio=self.statement.rank_ratio() if solved else np.nan,
             refined=False,
             variables=self._convex.variables() if solved else {},
         )
         if solved:
-            return self._conclude(self.statement.read(), answer, refine)
-        return self._explain_failure(answer, refine)
+            return self._conclude(self.statement.read(), answer, request.refine)
+        return self._explain_failure(answer, request.refine)
 
     def _explain_failure(self, answer: PosedAnswer, refine: bool | None) -> Fix:
         """Return the fix after a failure and its reason, from the outcome of the back end."""
@@ -189,10 +143,7 @@ class PosedConic(Posed):
                 return self._failed(Status.INFEASIBLE, text, answer)
             return self._without_solution(Status.INFEASIBLE, text, answer, refine)
         if report.outcome == "unbounded":
-            what = "your objective" if self.own_objective else "the objective"
-            return self._failed(
-                Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
-            )
+            return self._unbounded(answer)
         return self._without_solution(Status.NUMERICAL, str(report), answer, refine)
 
 

@@ -27,6 +27,46 @@ def test_names_are_given_or_counted(formulation):
 
 
 @pytest.mark.parametrize("formulation", ["hull", "nls"])
+def test_no_constraint_of_the_problem_is_lost_to_another_of_the_same_name(formulation):
+    problem = ranged(1)
+    free = solve(problem).position
+    discs = [constraints.disc(free + away, 30.0) for away in (np.array([40.0, 0.0]), np.array([0.0, 40.0]))]
+    fix = pose(replace(problem, constraints=(*discs[0], *discs[1])), formulation).solve(refine=False)
+    assert np.shape(fix.posed.duals["disc"]) == (2,)
+    assert fix.posed.values["disc"].max() < 1e-4
+
+
+def test_no_union_of_the_problem_is_lost_to_another_of_the_same_name():
+    problem = ranged(1)
+    free = solve(problem).position
+    corners = np.array([[-5.0, -5.0], [5.0, -5.0], [0.0, 5.0]])
+    both = [constraints.keep_out_polygon(free + corners + shift) for shift in (0.0, 4.0)]
+    fix = pose(replace(problem, constraints=(*both[0], *both[1])), "nls").solve(refine=False)
+    assert list(fix.posed.duals) == ["keep-out polygon", "keep-out polygon 2"]
+    assert fix.position == pytest.approx(solve(replace(problem, constraints=(*both[0], *both[1]))).position, abs=1e-3)
+
+
+def test_a_constraint_that_is_refused_leaves_nothing_behind():
+    problem = ranged(1)
+    free = solve(problem).position
+    posed = pose(problem, "nls")
+    outside = constraints.keep_out_polygon(free + np.array([[-5.0, -5.0], [5.0, -5.0], [0.0, 5.0]]), name="tower")
+    concave = constraints.keep_out_polygon(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 1.0], [0.0, 9.0]]))
+    with pytest.raises(InvalidProblem, match="union"):
+        posed.add((*outside, *concave))
+    fix = posed.solve()
+    assert fix.posed.duals == {}
+    assert fix.position == pytest.approx(free, abs=1e-3)
+
+
+@pytest.mark.parametrize("formulation", ["hull", "nls"])
+def test_a_constraint_without_limits_has_no_duals(formulation):
+    posed = pose(ranged(1), formulation)
+    posed.add(constraints.band([1.0, 0.0], -np.inf, np.inf), name="none")
+    assert len(posed.solve().posed.duals["none"]) == 0
+
+
+@pytest.mark.parametrize("formulation", ["hull", "nls"])
 def test_refinement_is_a_choice(formulation):
     problem = ranged(2)
     posed = pose(problem, formulation)
