@@ -314,6 +314,8 @@ def _value(part: Any) -> Array:
 
 def joined(values: Sequence[Array]) -> float | Array:
     """Return a single number as float, and several numbers as one vector or in their own shape."""
+    if not values:  # a constraint without a finite side
+        return np.zeros(0)
     if len(values) == 1:
         one = np.asarray(values[0])
         return float(one.ravel()[0]) if one.size == 1 else one

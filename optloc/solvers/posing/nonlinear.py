@@ -25,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.methods import METHODS, Method
 from optloc.solvers.posing.convex_constraints import members_of
 from optloc.solvers.posing.convex_statement import Relation
-from optloc.solvers.posing.posed import Posed, numbers_of_start
+from optloc.solvers.posing.posed import Posed, numbers_of_start, solver_name
 from optloc.solvers.scaled_program import ScaledProblem
 
 # Most iterations of IPOPT, as in the method "nlp".
@@ -88,6 +88,7 @@ class PosedProgram(Posed):
             try:
                 relation = self._table_relation(constraint, constraint.name)
             except InvalidProblem:  # a region that is no conjunction stays with the refinement
+                self.dropped.append(constraint.name)
                 continue
             self._put(relation)
 
@@ -306,7 +307,7 @@ class PosedProgram(Posed):
         refine: bool | None = None,
     ) -> Fix:
         """Return the judged fix of the posed problem; see `Posed.solve`."""
-        name = (solver or "ipopt").lower()
+        name = solver_name(solver, settings, "ipopt").lower()
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
         own = {**(_SETTINGS if name == "ipopt" else {}), **(settings or {})}
         if warm and name == "ipopt" and duals is not None:
@@ -354,9 +355,10 @@ class PosedProgram(Posed):
         try:
             program = Program.of(self._program, self._statement, choice=choice, settings=settings)
         except RuntimeError:  # CasADi raises no other type
-            given = ", ".join(one for one in settings if one not in {**_SETTINGS, **_FROM_SOLUTION}) or "of optloc"
+            ours = {**_SETTINGS, **_FROM_SOLUTION}
+            given = ", ".join(str(one) for one, value in settings.items() if one not in ours or value != ours[one])
             raise InvalidProblem(
-                f"{name} does not accept the settings {given}", "settings", "check their names"
+                f"{name} does not accept the settings {given or 'of optloc'}", "settings", "check names and values"
             ) from None
         own, ends, failure = self._own, list[Local](), ""
         multipliers = None if duals is None else (np.zeros(program.n), self._multipliers(duals))

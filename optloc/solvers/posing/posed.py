@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Polygon, Status
 from optloc.linear.constraints import is_conjunctive
 from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
@@ -54,6 +54,8 @@ class Posed(ABC):
     def __init__(self, stated: Problem, formulation: str) -> None:
         self.stated, self.formulation = stated, formulation
         self.relations: dict[str, Relation] = {}
+        # names of constraints and fences of the problem that the posed problem lacks; only the refinement obeys them
+        self.dropped: list[str] = []
         self.own_objective = False
 
     def __repr__(self) -> str:
@@ -145,6 +147,14 @@ class Posed(ABC):
         if members is not None:
             self._add_table(members, name)
             return
+        if isinstance(constraint, Fence) or (
+            isinstance(constraint, tuple | list) and any(isinstance(one, Fence) for one in constraint)
+        ):
+            raise InvalidProblem(
+                "a fence is a term of the cost and no constraint",
+                "constraint",
+                "give it to optloc.assemble, and pose that problem by 'nls'",
+            )
         if isinstance(constraint, bool | np.bool_):
             raise InvalidProblem(
                 "the relation has no unknown of this problem", "constraint", "use posed.position or posed.of(name)"
@@ -270,13 +280,14 @@ class Posed(ABC):
             return self._failed(Status.NUMERICAL, "the solution of the posed problem gives no position", answer)
         if not wanted:
             fix = _of_pool(self.stated, starts[:1], None)
-            reason = f"the optimum of the posed problem{self._changes()}, not refined"
+            lost = f", without {_constraints(self.dropped)}" if self.dropped else ""
+            reason = f"the optimum of the posed problem{self._changes()}{lost}, not refined"
             return _marked(fix, Status.UNREFINED, reason, replace(answer, refined=False))
         fix = _of_pool(self.stated, pack(starts[None])[0], self._refinement)
         answer = replace(answer, refined=True)
         if not (self.free or self.own_objective):
             return replace(fix, posed=answer)
-        without = [f"the constraint{'s' if len(self.free) > 1 else ''} {_quoted(self.free)}"] if self.free else []
+        without = [f"the {_constraints(self.free)}"] if self.free else []
         without += ["your objective"] if self.own_objective else []
         reason = f"refined without {' and '.join(without)}"
         if not bool(fix.answered):
@@ -304,9 +315,7 @@ class Posed(ABC):
 
     def _changes(self) -> str:
         """Return the changes of the posed problem as the end of a sentence."""
-        what = (
-            [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
-        )
+        what = [_constraints(self.relations)] if self.relations else []
         what += ["your objective"] if self.own_objective else []
         return f" with {' and '.join(what)}" if what else ""
 
@@ -336,6 +345,17 @@ def numbers_of_start(start: Any, sizes: Sequence[int]) -> Array:
     return value
 
 
+def solver_name(solver: str | None, settings: Mapping[str, Any] | None, default: str) -> str:
+    """Return the name of a back end; raise InvalidProblem if it is no text, or `settings` is no mapping."""
+    if not (solver is None or isinstance(solver, str)):
+        raise InvalidProblem(f"{solver!r} is not the name of a solver", "solver", "see 'optloc list solvers'")
+    if not (settings is None or isinstance(settings, Mapping)):
+        raise InvalidProblem(
+            f"{settings!r} is no dictionary", "settings", "give a dictionary, such as {'max_iter': 50}"
+        )
+    return solver or default
+
+
 def _table_members(constraint: Any) -> list[Constraint] | None:
     """Return constraints of the table as a list; None for anything else."""
     kinds = Band | Polygon | AnyOf
@@ -346,9 +366,10 @@ def _table_members(constraint: Any) -> list[Constraint] | None:
     return None
 
 
-def _quoted(names: Iterable[str]) -> str:
-    """Return names in quotation marks, joined by "and"."""
-    return " and ".join(f'"{name}"' for name in names)
+def _constraints(names: Collection[str]) -> str:
+    """Return the word "constraint" or "constraints", and the names in quotation marks, joined by "and"."""
+    quoted = " and ".join(f'"{name}"' for name in names)
+    return f"constraint{'s' if len(names) > 1 else ''} {quoted}"
 
 
 def _joined(reason: Any, more: str) -> Array:

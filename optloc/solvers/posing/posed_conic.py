@@ -10,13 +10,14 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Band, Status
+from optloc.linear.constraints import is_exact
 from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
 from optloc.solvers.posing.convex_statement import ConicStatement, Relation
-from optloc.solvers.posing.posed import Posed, numbers_of_start
+from optloc.solvers.posing.posed import Posed, numbers_of_start, solver_name
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
@@ -41,6 +42,7 @@ class PosedConic(Posed):
         self._convex = ConvexProgram(statement.program, statement.size, statement.constant, statement.settings)
         self.relations = self._convex.relations
         self._restate()
+        self.dropped += [fence.name for fence in stated.fences]
         for constraint in stated.constraints:
             self._take_over(constraint)
 
@@ -49,6 +51,8 @@ class PosedConic(Posed):
         try:
             relation = self._table_relation(constraint, constraint.name)
         except InvalidProblem:
+            if not (self.statement.at_height and getattr(constraint, "kind", "") == "height" and is_exact(constraint)):
+                self.dropped.append(constraint.name)
             return
         before = self.relations.get(constraint.name)
         if before is not None:
@@ -162,7 +166,7 @@ class PosedConic(Posed):
             layout = self.stated.layout
             numbers_of_start(start, (layout.size, layout.n_shared, self.stated.dimension))
         first = earlier.variables if isinstance(earlier, PosedAnswer) else None
-        report = self._convex.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=first)
+        report = self._convex.solve(solver_name(solver, settings, "CLARABEL").upper(), settings, warm=warm, start=first)
         solved = self._convex.has_solution(report)
         own_duals, values, cost = self._convex.results(solved=solved)
         answer = PosedAnswer(
