@@ -213,35 +213,36 @@ class PosedProgram(Posed):
         self._check_unknowns(ca.vertcat(*(left for left, _ in pairs)), "constraint")
         return pairs
 
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals."""
         import casadi as ca
 
-        planes = []
+        planes, lengths = [], []
         try:
             position = self.of("position")
         except InvalidProblem:
-            return []
+            return [], []
         if position.shape[1] != 1:
-            return []
+            return [], []
         layout = self._own.problem.layout
         slot = next(slot for slot in layout.shared if slot.name.partition("[")[0] == "position")
         y = self._base.x[slot.start : slot.start + slot.size]
         for left, equal in self._pairs(constraint):
             others = [self._base.x[i] for i in range(layout.size) if not slot.start <= i < slot.start + slot.size]
             if ca.depends_on(left, ca.vertcat(*others, self._base.p)) or not ca.is_linear(left, y):
-                return []
+                return [], []
             slope, constant = ca.linear_coeff(left, y)
             unit = self._own.unit[slot.start : slot.start + slot.size]
             normal = np.asarray(ca.DM(slope)).ravel() / unit
             shift = float(ca.DM(constant)) - normal @ self._own.centre[slot.start : slot.start + slot.size]
             length = float(np.linalg.norm(normal))
             if not length > 0.0:
-                return []
+                return [], []
             offset = np.asarray(-shift / length)
             lower = offset if equal else np.asarray(-np.inf)
             planes.append(Band("plane", lower, offset, normal / length, name, _target(slot.name)))
-        return planes
+            lengths.append(length)
+        return planes, lengths
 
     def _relation(self, constraint: Any, name: str) -> Relation:
         """Return a relation of CasADi, divided by its own unit."""

@@ -160,9 +160,14 @@ class Posed(ABC):
                 "the relation has no unknown of this problem", "constraint", "use posed.position or posed.of(name)"
             )
         free = self._new_name(name)
-        planes = self._as_planes(constraint, free)
+        planes, lengths = self._as_planes(constraint, free)
         if planes:
             self._add_table(planes, free)
+            stored = self.relations[free]
+            if len(stored.divisor) == len(lengths):  # duals and values are of the relation as it is written
+                self.relations[free] = replace(
+                    stored, divisor=tuple(d * size for d, size in zip(stored.divisor, lengths, strict=True))
+                )
         else:
             self._put(self._relation(constraint, free))
 
@@ -251,8 +256,11 @@ class Posed(ABC):
         """
 
     @abstractmethod
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals.
+
+        Both are empty for any other relation.
+        """
 
     @abstractmethod
     def _relation(self, constraint: Any, name: str) -> Relation:

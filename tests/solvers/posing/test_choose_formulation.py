@@ -157,4 +157,4 @@ def test_what_cannot_be_posed_is_refused_by_a_sentence():
 @pytest.mark.parametrize("word", [None, 3])
 def test_a_formulation_is_a_text(word):
     with pytest.raises(InvalidProblem, match="is not the name of a formulation"):
-        pose(ranged(1), word)
+        pose(differences(1), word)

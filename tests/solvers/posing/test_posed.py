@@ -161,3 +161,24 @@ def test_an_infinite_limit_is_no_limit(formulation):
 def test_wrong_types_of_solver_and_settings_are_named(formulation, given):
     with pytest.raises(InvalidProblem, match="max_iter" if given == {"settings": {"max_iter": -1}} else "^s"):
         pose(ranged(2), formulation).solve(**given)
+
+
+@pytest.mark.parametrize("formulation", ["shor", "hull", "nls"])
+def test_a_dual_is_for_the_relation_as_it_is_written_and_limits_come_in_one_order(formulation):
+    problem = differences(3, scale=600.0)
+    at = solve(problem).position[0] - 5.0
+    found = []
+    for factor in (1.0, -2.5):
+        posed = pose(problem, formulation)
+        side = factor * posed.position[0]
+        posed.add(side <= factor * at if factor > 0 else side >= factor * at, name="quay")
+        posed.add(factor * posed.position[0] <= 1e4, name="far")
+        found.append(posed.solve(refine=False).posed)
+    assert found[0].duals["quay"] > 1e-3
+    assert found[1].duals["quay"] == pytest.approx(found[0].duals["quay"] / 2.5, rel=1e-5)
+    assert found[1].values["far"] == pytest.approx(-2.5 * at - 1e4, rel=1e-6)
+    posed = pose(problem, formulation)
+    posed.add(constraints.band([1.0, 0.0], at - 1e3, at), name="band")
+    lower, upper = posed.solve(refine=False).posed.duals["band"]
+    assert upper > 1e-3
+    assert abs(lower) < 1e-6
