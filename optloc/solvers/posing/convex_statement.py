@@ -40,6 +40,8 @@ class ConicStatement:
         Returns the distance of the solution from a point; near zero means exact.
     within : str
         Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
+    at_height : bool
+        Whether the formulation itself keeps the exact height of the problem.
     settings : mapping of str to float
         Settings of Clarabel with which the method of the same name solves.
     """
@@ -55,6 +57,7 @@ class ConicStatement:
     residual: Any = None
     missing: Mapping[str, str] = field(default_factory=dict)
     within: str = ""
+    at_height: bool = False
     settings: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -104,34 +104,36 @@ class PosedProgram(Posed):
 
     # Changes.
 
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals."""
         import casadi as ca
 
         try:
             position = self.of("position")
         except InvalidProblem:
-            return []
+            return [], []
         if position.shape[1] != 1:
-            return []
+            return [], []
         slot = next(slot for slot in self._own.problem.layout.shared if slot.name.partition("[")[0] == "position")
         place = slice(slot.start, slot.start + slot.size)
         x, p = self._nonlinear.base.x, self._nonlinear.base.p
         y, others = x[place], ca.vertcat(x[: place.start], x[place.stop :], p)
-        planes = []
+        planes: list[Band] = []
+        lengths: list[float] = []
         for left, equal in self._nonlinear.pairs(constraint):
             if ca.depends_on(left, others) or not ca.is_linear(left, y):
-                return []
+                return [], []
             slope, constant = ca.linear_coeff(left, y)
             normal = np.asarray(ca.DM(slope)).ravel() / self._own.unit[place]
             shift = float(ca.DM(constant)) - normal @ self._own.centre[place]
             length = float(np.linalg.norm(normal))
             if not length > 0.0:
-                return []
+                return [], []
             offset = np.asarray(-shift / length)
             lower = offset if equal else np.asarray(-np.inf)
             planes.append(Band("plane", lower, offset, normal / length, name, _target(slot.name)))
-        return planes
+            lengths.append(length)
+        return planes, lengths
 
     def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
         """Return a constraint of the table as expressions of CasADi, in units of length; see `Posed`."""

@@ -221,9 +221,9 @@ class NonlinearProgram:
         try:
             program = Program.of(data.program, self.statement, choice=choice, settings=own)
         except RuntimeError:  # CasADi raises no other type
-            given = ", ".join(one for one in settings if one not in {**_SETTINGS, **_FROM_SOLUTION}) or "of optloc"
+            given = ", ".join(map(str, settings)) or "of optloc"
             raise InvalidProblem(
-                f"{name} does not accept the settings {given}", "settings", "check their names"
+                f"{name} does not accept the settings {given}", "settings", "check names and values"
             ) from None
         ends, failure = list[Local](), ""
         multipliers = None if duals is None else (np.zeros(program.n), self._multipliers(duals))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Polygon, Status
 from optloc.linear.constraints import is_conjunctive
 from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
@@ -60,6 +60,8 @@ class Posed(PosedProblem, ABC):
         self.stated, self.formulation, self.origin, self.unit = stated, formulation, origin, unit
         # the alternatives of each union, one of which is among the relations
         self._unions: dict[str, list[Relation]] = {}
+        # names of constraints and fences of the problem that the posed problem lacks; only the refinement obeys them
+        self.dropped: list[str] = []
 
     def __repr__(self) -> str:
         """Return the name of the formulation, and the changes, as text."""
@@ -150,14 +152,26 @@ class Posed(PosedProblem, ABC):
         if members is not None:
             self._add_table(members, name)
             return
+        if isinstance(constraint, Fence) or (
+            isinstance(constraint, tuple | list) and any(isinstance(one, Fence) for one in constraint)
+        ):
+            raise InvalidProblem(
+                "a fence is a term of the cost and no constraint",
+                "constraint",
+                "give it to optloc.assemble, and pose that problem by 'nls'",
+            )
         if isinstance(constraint, bool | np.bool_):
             raise InvalidProblem(
                 "the relation has no unknown of this problem", "constraint", f"use expressions as in {EXAMPLE}"
             )
         free = self._new_name(name)
-        planes = self._as_planes(constraint, free)
+        planes, lengths = self._as_planes(constraint, free)
         if planes:
             self._add_table(planes, free)
+            stored = self.relations[free]
+            if len(stored.divisor) == len(lengths):  # duals and values are of the relation as it is written
+                units = tuple(d * size for d, size in zip(stored.divisor, lengths, strict=True))
+                self._program.relations[free] = replace(stored, divisor=units)
         else:
             self._put(self._program.relation(constraint, free))
 
@@ -188,8 +202,14 @@ class Posed(PosedProblem, ABC):
             try:
                 alternatives = self._table_relations(one, label)
             except InvalidProblem:
+                if not self._keeps(one):
+                    self.dropped.append(one.name)
                 continue
             self._put_one_of(alternatives if before is None or alone else _together([before], alternatives))
+
+    def _keeps(self, constraint: Constraint) -> bool:
+        """Return whether the formulation itself keeps a constraint of the problem that its back end cannot state."""
+        return False
 
     def _put_one_of(self, alternatives: Sequence[Relation]) -> None:
         """State the problem with the first of the alternatives of a constraint, and keep the others for the solve."""
@@ -234,6 +254,12 @@ class Posed(PosedProblem, ABC):
             refinement. If the back end finds no solution then, the reason says so, and the starts alone are refined.
         """
         warm = (start is not None or duals is not None) if warm_start is None else warm_start
+        if not (solver is None or isinstance(solver, str)):
+            raise InvalidProblem(f"{solver!r} is not the name of a solver", "solver", "see 'optloc list solvers'")
+        if not (settings is None or isinstance(settings, Mapping)):
+            raise InvalidProblem(
+                f"{settings!r} is no dictionary", "settings", "give a dictionary, such as {'max_iter': 50}"
+            )
         return self._solve(SolveRequest(solver, settings or {}, start, duals, warm, refine))
 
     @abstractmethod
@@ -241,8 +267,11 @@ class Posed(PosedProblem, ABC):
         """Return the judged fix; see `solve`."""
 
     @abstractmethod
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals.
+
+        Both are empty for any other relation.
+        """
 
     @abstractmethod
     def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
@@ -268,13 +297,14 @@ class Posed(PosedProblem, ABC):
             return self._failed(Status.NUMERICAL, "the solution of the posed problem gives no position", answer)
         if not wanted:
             fix = _of_pool(self.stated, starts[:1], None)
-            reason = f"the optimum of the posed problem{self._changes()}, not refined"
+            lost = f", without {_constraints(self.dropped)}" if self.dropped else ""
+            reason = f"the optimum of the posed problem{self._changes()}{lost}, not refined"
             return _marked(fix, Status.UNREFINED, reason, replace(answer, refined=False))
         fix = _of_pool(self.stated, pack(starts[None])[0], self._refinement)
         answer = replace(answer, refined=True)
         if not (self.free or self.own_objective):
             return replace(fix, posed=answer)
-        without = [f"the constraint{'s' if len(self.free) > 1 else ''} {_quoted(self.free)}"] if self.free else []
+        without = [f"the {_constraints(self.free)}"] if self.free else []
         without += ["your objective"] if self.own_objective else []
         reason = f"refined without {' and '.join(without)}"
         if not bool(fix.answered):
@@ -302,9 +332,7 @@ class Posed(PosedProblem, ABC):
 
     def _changes(self) -> str:
         """Return the changes of the posed problem as the end of a sentence."""
-        what = (
-            [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
-        )
+        what = [_constraints(self.relations)] if self.relations else []
         what += ["your objective"] if self.own_objective else []
         return f" with {' and '.join(what)}" if what else ""
 
@@ -360,9 +388,10 @@ def _together(before: Sequence[Relation] | None, more: list[Relation]) -> list[R
     return [replace(first, parts=(*first.parts, *second.parts), divisor=(*first.divisor, *second.divisor))]
 
 
-def _quoted(names: Iterable[str]) -> str:
-    """Return names in quotation marks, joined by "and"."""
-    return " and ".join(f'"{name}"' for name in names)
+def _constraints(names: Collection[str]) -> str:
+    """Return the word "constraint" or "constraints", and the names in quotation marks, joined by "and"."""
+    quoted = " and ".join(f'"{name}"' for name in names)
+    return f"constraint{'s' if len(names) > 1 else ''} {quoted}"
 
 
 def _joined(reason: Any, more: str) -> Array:

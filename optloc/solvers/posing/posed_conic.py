@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band, Status
+from optloc.base.types import Array, Band, Constraint, Status
+from optloc.linear.constraints import is_exact
 from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
@@ -20,6 +21,10 @@ from optloc.solvers.posing.posed_problem import Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
+# Difference of value and bound, relative to the value, from which an objective of the user counts as unbounded.
+# Clarabel reports solutions of unbounded problems at 1e8 m, whose bounds are 1e8 times lower; bounds of other solutions
+# agree to 1e-6.
+_SLACK = 1e-2
 
 
 class PosedConic(Posed):
@@ -39,7 +44,12 @@ class PosedConic(Posed):
         self.statement = statement
         self._convex = ConvexProgram(statement.program, statement.size, statement.constant, statement.settings)
         super().__init__(stated, formulation, self._convex, statement.origin, statement.unit)
+        self.dropped += [fence.name for fence in stated.fences]
         self._take_over()
+
+    def _keeps(self, constraint: Constraint) -> bool:
+        """Return whether the formulation itself keeps a constraint of the problem: an exact height."""
+        return self.statement.at_height and getattr(constraint, "kind", "") == "height" and is_exact(constraint)
 
     # Parts.
 
@@ -68,15 +78,15 @@ class PosedConic(Posed):
 
     # Changes.
 
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals."""
         import cvxpy as cp
 
         if not isinstance(constraint, cp.constraints.Inequality | cp.constraints.Equality):
-            return []
+            return [], []
         expression, position = constraint.expr, self.statement.parts.get("position")
         if position is None or not expression.is_affine() or expression.parameters():
-            return []
+            return [], []
         self._convex.check_unknowns(expression, "constraint")
         with self._convex.probe(expression, position):
             slope, place = self._convex.gradient(expression), self._convex.gradient(position)
@@ -86,17 +96,18 @@ class PosedConic(Posed):
             normal = np.linalg.lstsq(full[0].T, full[1].T, rcond=None)[0].T
             # a column of the lift and its transpose are one number, but two entries of a gradient
             if np.abs(normal @ full[0] - full[1]).max() > _ALONE * (1.0 + np.abs(full[1]).max()):
-                return []
+                return [], []
             offset = normal @ position.value - np.ravel(expression.value, order="F")
         equal = isinstance(constraint, cp.constraints.Equality)
         length = np.linalg.norm(normal, axis=1)
         if not (length > 0.0).all():
-            return []
+            return [], []
         lower = offset / length if equal else np.full(len(offset), -np.inf)
-        return [
+        planes = [
             Band("plane", np.asarray(low), np.asarray(up), direction, name)
             for low, up, direction in zip(lower, offset / length, normal / length[:, None], strict=True)
         ]
+        return planes, length.tolist()
 
     def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
         """Return a constraint of the table as relations of cvxpy, divided by the unit of length."""
@@ -130,6 +141,12 @@ class PosedConic(Posed):
             refined=False,
             variables=self._convex.variables() if solved else {},
         )
+        if solved and self.own_objective and answer.bound < answer.value - _SLACK * (1.0 + abs(answer.value)):
+            text = (
+                f"your objective may have no least value: {answer.value:.3g} is above the bound {answer.bound:.3g}; "
+                "add limits"
+            )
+            return self._failed(Status.NUMERICAL, text, answer)
         if solved:
             return self._conclude(self.statement.read(), answer, request.refine)
         return self._explain_failure(answer, request.refine)

@@ -99,6 +99,7 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
         origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])) if given else np.zeros(3),
         unit=WGS84_A,
         parts={"position": shift + places @ lift[:, 0]},
+        at_height=True,
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
         settings=settings_of(),

@@ -152,3 +152,9 @@ def test_what_cannot_be_posed_is_refused_by_a_sentence():
     )
     with pytest.raises(InvalidProblem, match="does not cover"):
         pose(two, "squared_range_conic: shor")
+
+
+@pytest.mark.parametrize("word", [None, 3])
+def test_a_formulation_is_a_text(word):
+    with pytest.raises(InvalidProblem, match="is not the name of a formulation"):
+        pose(differences(1), word)

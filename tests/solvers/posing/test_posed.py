@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solvers.posing.scenes import differences, ranged
+from solvers.posing.scenes import differences, levelled, ranged
 
 from optloc import Fix, InvalidProblem, Status, constraints, pose, solve
 from optloc.linear.constraints import violation
@@ -168,3 +168,59 @@ def test_an_unrefined_fix_says_what_refines_it_and_that_chi_square_is_not_comput
     assert "for a pose use refine=True or a constraint of optloc.constraints" in text
     assert "chi-square not computed: there is no refined answer" in text
     assert "nothing to test" not in text
+
+
+@pytest.mark.parametrize("formulation", ["hull", "shor", "nls"])
+def test_a_fix_that_is_not_refined_names_the_constraints_that_the_posed_problem_lacks(formulation):
+    corner = constraints.polygon([[-9e3, -9e3], [9e3, -9e3], [0.0, 0.0], [9e3, 9e3], [-9e3, 9e3]], name="corner")
+    fix = pose(replace(ranged(2), constraints=corner), formulation).solve(refine=False)
+    assert 'without constraint "corner", not refined' in str(fix.reason)
+
+
+def test_a_known_height_that_a_relaxation_keeps_is_not_missing():
+    assert str(pose(levelled(1), "range_height_conic").solve(refine=False).reason).count("without") == 0
+
+
+def test_a_relaxation_names_the_fence_that_it_lacks():
+    shore = constraints.fence((1.0, 0.0), 0.0, 5.0, name="shore")
+    fix = pose(replace(ranged(2), constraints=shore), "hull").solve(refine=False)
+    assert 'without constraint "shore"' in str(fix.reason)
+    with pytest.raises(InvalidProblem, match="a fence is a term of the cost"):
+        pose(ranged(2), "nls").add(shore)
+
+
+@pytest.mark.parametrize("formulation", ["hull", "nls"])
+def test_an_infinite_limit_is_no_limit(formulation):
+    posed = pose(ranged(2), formulation)
+    posed.add(posed.position[0] <= np.inf, name="none")
+    fix = posed.solve()
+    assert fix.status == solve(ranged(2)).status
+    assert np.size(fix.posed.duals["none"]) == 0
+
+
+@pytest.mark.parametrize("formulation", ["hull", "nls"])
+@pytest.mark.parametrize("given", [{"solver": 3}, {"settings": 3}, {"settings": {"max_iter": -1}}])
+def test_wrong_types_of_solver_and_settings_are_named(formulation, given):
+    with pytest.raises(InvalidProblem, match="max_iter" if given == {"settings": {"max_iter": -1}} else "^s"):
+        pose(ranged(2), formulation).solve(**given)
+
+
+@pytest.mark.parametrize("formulation", ["shor", "hull", "nls"])
+def test_a_dual_is_for_the_relation_as_it_is_written_and_limits_come_in_one_order(formulation):
+    problem = differences(3, scale=600.0)
+    at = solve(problem).position[0] - 5.0
+    found = []
+    for factor in (1.0, -2.5):
+        posed = pose(problem, formulation)
+        side = factor * posed.position[0]
+        posed.add(side <= factor * at if factor > 0 else side >= factor * at, name="quay")
+        posed.add(factor * posed.position[0] <= 1e4, name="far")
+        found.append(posed.solve(refine=False).posed)
+    assert found[0].duals["quay"] > 1e-3
+    assert found[1].duals["quay"] == pytest.approx(found[0].duals["quay"] / 2.5, rel=1e-5)
+    assert found[1].values["far"] == pytest.approx(-2.5 * at - 1e4, rel=1e-6)
+    posed = pose(problem, formulation)
+    posed.add(constraints.band([1.0, 0.0], at - 1e3, at), name="band")
+    lower, upper = posed.solve(refine=False).posed.duals["band"]
+    assert upper > 1e-3
+    assert abs(lower) < 1e-6
