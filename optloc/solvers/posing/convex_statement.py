@@ -62,8 +62,10 @@ class ConicStatement:
         Returns the distance of the solution from a point; near zero means exact.
     within : str
         Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
+    nowhere : str
+        The sentence for a program without any point, before changes.
     settings : mapping of str to float
-        Settings of Clarabel with which the method of the same name solves.
+        Settings of Clarabel.
     """
 
     program: Any
@@ -77,6 +79,7 @@ class ConicStatement:
     residual: Any = None
     missing: Mapping[str, str] = field(default_factory=dict)
     within: str = ""
+    nowhere: str = "no point meets the posed problem"
     settings: Mapping[str, float] = field(default_factory=dict)
 
 
