@@ -37,11 +37,11 @@ def test_residuals_at_any_scale(formulation):
 
 @pytest.mark.parametrize("formulation", ["squared_range_conic: hull", "sparse_errors", "nls"])
 def test_a_dual_is_the_slope_of_the_optimum(formulation):
-    outcome, worst, error, smooth = fenced(formulation, 0)
-    assert outcome in ("solved", "inaccurate")
-    assert smooth
-    assert worst <= 1e-6
-    assert error <= 1e-4
+    found = fenced(formulation, 0)
+    assert found.outcome in ("solved", "inaccurate")
+    assert found.smooth
+    assert found.worst <= 1e-6
+    assert found.error <= 1e-4
 
 
 @pytest.mark.full
