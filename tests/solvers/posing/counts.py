@@ -29,20 +29,21 @@ HEADER = [
 def record(formulation, seed):
     """Return the measures of one problem as a dictionary of plain numbers."""
     if formulation in WITHOUT_POSITION:
-        base = pose(drawn(formulation, seed), formulation).solve(refine=False).posed
+        posed = pose(drawn(formulation, seed), formulation)
+        base, unit = posed.solve(refine=False).posed, posed.unit
         out = {"seed": seed, "outcome": "without position", "worst": base.backend.worst}
     else:
         found = fenced(formulation, seed)
-        base = found.base
+        base, unit = found.base, found.unit
         out = {"seed": seed, "outcome": found.outcome, "worst": found.worst}
         if found.outcome in ("no point", "infeasible"):
             # only rows that fit at isolated points may have no solution beside the optimum
             isolated = formulation in ISOLATED
             out["denied"] = denied_points(formulation, seed, fence=found.outcome != "no point") if isolated else 1
-        else:
+        elif found.outcome != "failed":
             out |= {"error": found.error, "smooth": found.smooth}
-    if formulation in LEAST and out["outcome"] != "no point":
-        out["above"] = above_least(formulation, seed, base)
+    if formulation in LEAST and out["outcome"] not in ("no point", "failed"):
+        out["above"] = above_least(formulation, seed, base, unit)
     return out
 
 
@@ -84,7 +85,7 @@ def row(records):
     denied = [one["denied"] for one in records if "denied" in one]
     return [
         len(records),
-        f"{worst.max():.0e}",
+        f"{np.nanmax(worst):.0e}",
         int((~(worst <= KKT)).sum()),
         len(error),
         kinks if len(error) else "",

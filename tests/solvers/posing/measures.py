@@ -32,8 +32,8 @@ WIDE = 0.05
 # Formulations whose rows fit exactly at isolated points: a half-plane beside the point has no solution.
 ISOLATED = ("range_height_conic",)
 WITHOUT_POSITION = ("direction_sdp",)
-# Formulations whose cost is in metres or square metres. All others have chi-square, of which one is a natural unit.
-IN_METRES = ("minimax_cone", "range_height_conic")
+# Powers of metres of the costs that are no chi-square. Chi-square has a natural unit, one.
+IN_METRES = {"minimax_cone": 1, "range_height_conic": 2}
 # Methods of the covariance that sets the size of steps, where the default takes a minute.
 QUICK = {"registration_sdp": "sdp+lsr"}
 
@@ -58,8 +58,10 @@ class Fenced:
     ----------
     base : PosedAnswer
         The answer without the half-plane.
+    unit : float
+        Unit of length, metres.
     outcome : str
-        Outcome with the half-plane; "no point" if the rows alone have no solution.
+        Outcome with the half-plane; "no point" if the rows alone have no solution, "failed" if the solver found none.
     worst : float
         Largest residual of both solves.
     error : float
@@ -70,6 +72,7 @@ class Fenced:
     """
 
     base: PosedAnswer
+    unit: float
     outcome: str
     worst: float
     error: float = np.nan
@@ -82,7 +85,9 @@ def fenced(formulation, seed):
     plain = pose(problem, formulation)
     base, unit = plain.solve(refine=False), plain.unit
     if base.posed.backend.outcome == "infeasible":
-        return Fenced(base.posed, "no point", 0.0)
+        return Fenced(base.posed, unit, "no point", 0.0)
+    if not np.isfinite(base.x).all():
+        return Fenced(base.posed, unit, "failed", np.nan)
     normal, offset, sigma = fence_beside(problem, formulation, base, seed)
 
     @cache
@@ -93,10 +98,10 @@ def fenced(formulation, seed):
 
     here, worst = at(0.0), base.posed.backend.worst
     if here.backend.outcome == "infeasible":
-        return Fenced(base.posed, "infeasible", worst)
+        return Fenced(base.posed, unit, "infeasible", worst)
     worst = float(np.max([worst, here.backend.worst]))
     error, smooth = dual_error(formulation, at, unit, sigma)
-    return Fenced(base.posed, here.backend.outcome, worst, float(error), smooth)
+    return Fenced(base.posed, unit, here.backend.outcome, worst, float(error), smooth)
 
 
 def dual_error(formulation, at, unit, sigma):
@@ -167,18 +172,20 @@ def denied_points(formulation, seed, *, fence):
 
 
 def above_multi_start(formulation, seed):
-    """Return by how much bound and value exceed the least posed cost over many points, relative to one plus this cost.
+    """Return by how much bound and value exceed the least posed cost over many points; see `above_least`."""
+    posed = pose(drawn(formulation, seed), formulation)
+    return above_least(formulation, seed, posed.solve(refine=False).posed, posed.unit)
 
-    The judge evaluates the cost itself at points, and knows nothing of the relaxation.
+
+def above_least(formulation, seed, found, unit):
+    """Return by how much an answer exceeds the least posed cost over many points, relative to one plus this cost.
+
+    The judge evaluates the cost itself at points, and knows nothing of the relaxation. A cost in metres is relative to
+    the unit of length.
     """
-    return above_least(formulation, seed, pose(drawn(formulation, seed), formulation).solve(refine=False).posed)
-
-
-def above_least(formulation, seed, found):
-    """Return by how much an answer exceeds the least posed cost over many points; see `above_multi_start`."""
     least = LEAST[formulation](drawn(formulation, seed).flat())
-    natural = 0.0 if formulation in IN_METRES else 1.0
-    return float((np.nanmax([found.bound, found.value]) - least) / (natural + abs(least)))
+    one = unit ** IN_METRES.get(formulation, 0)
+    return float((np.nanmax([found.bound, found.value]) - least) / (one + abs(least)))
 
 
 def least_squared(problem, pick):
