@@ -93,6 +93,6 @@ def row(records):
         int((~(error <= DUAL)).sum()) if len(error) else "",
         len(denied),
         sum(denied),
-        len(above) if len(above) else "",
+        len(above) or "",
         int((~(above <= ABOVE)).sum()) if len(above) else "",
     ]

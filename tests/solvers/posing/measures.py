@@ -260,9 +260,7 @@ def least_ball(problem):
 
     starts = np.random.default_rng(1).normal(size=(12, 3))
     settings = {"xatol": 1e-12, "fatol": 1e-15, "maxiter": 2000}
-    return float(seen.scale[0]) * min(
-        minimize(outside, w, method="Nelder-Mead", options=settings).fun for w in starts
-    )
+    return float(seen.scale[0]) * min(minimize(outside, w, method="Nelder-Mead", options=settings).fun for w in starts)
 
 
 LEAST = {
