@@ -88,8 +88,8 @@ def pose_minimax(problem: Problem, locate: Locate) -> ConicStatement:
     if found is None or cones is None or not np.isfinite(found.level):
         raise InvalidProblem("no position is in front of two bearings or more", "formulation", 'use "nls"')
     ahead, station, scale = cones
-    # In this unit the cones are about one wide at the fix, and the ball is inside them. In sizes of the array both are so
-    # small that duals have three digits only.
+    # In this unit the cones are about one wide at the fix, and the ball is inside them. In sizes of the array both are
+    # so small that duals have three digits only.
     wide = max(found.level, 1.0) * np.max(scale * np.linalg.norm(found.point - station, axis=1))
     size, centre = min(float(wide), 1.0), found.point
     program = ball_problem(*ahead.shape)
