@@ -21,10 +21,12 @@ _SEED = 20261130
 _SMALLER = (1e-3, 1e-6)
 # Largest violation of a rule, in its unit of order one, at which a further attempt found a point.
 _MET = 1e-5
-# If Clarabel stops early with a larger residual than this, its factorisation may have lost its digits. The settings are
-# for a second attempt, as in `formulations.conic`.
-_FINE = 1e-7
-_REGULAR = {"static_regularization_constant": 1e-7}
+# If Clarabel stops early with a larger residual than a limit, its factorisation may have lost its digits. The settings
+# are for further attempts: the first as in `formulations.conic`, the second with shorter steps and refined directions.
+_AGAIN: tuple[tuple[float, dict[str, float]], ...] = (
+    (1e-7, {"static_regularization_constant": 1e-7}),
+    (1e-6, {"max_step_fraction": 0.8, "iterative_refinement_max_iter": 50, "iterative_refinement_stop_ratio": 1.5}),
+)
 
 
 class ConvexProgram:
@@ -203,11 +205,8 @@ class ConvexProgram:
                 one.value = one.project(value)
         try:
             report = solve_problem(self.program, solver, own, warm=warm)
-            if solver == "CLARABEL" and report.outcome in ("failed", "inaccurate") and not report.worst <= _FINE:
-                again = solve_problem(self.program, solver, {**_REGULAR, **own})
-                # the variables keep the values of the last solve
-                better = again.worst <= report.worst or not np.isfinite(report.worst)
-                report = again if better else solve_problem(self.program, solver, own)
+            if solver == "CLARABEL":
+                report = self._solve_again(report, own)
             if solver == "CLARABEL" and self.relations and report.outcome in ("failed", "infeasible"):
                 report = self._solve_smaller(report, own)
         except ValueError as trouble:
@@ -222,6 +221,21 @@ class ConvexProgram:
             text = f"{solver} does not use start and duals, because it is an interior-point or simplex method"
             report = replace(report, message="; ".join(filter(None, [report.message, text])))
         return report
+
+    def _solve_again(self, report: Any, settings: Mapping[str, Any]) -> Any:
+        """Return the best report of Clarabel with further settings, or `report` if its residuals are small."""
+        from formulations.conic_solvers import solve_problem
+
+        best, used, last = report, settings, settings
+        for limit, more in _AGAIN:
+            if best.outcome not in ("failed", "inaccurate") or best.worst <= limit:
+                break
+            last = {**more, **settings}
+            again = solve_problem(self.program, "CLARABEL", last)
+            if again.worst <= best.worst or not np.isfinite(best.worst):
+                best, used = again, last
+        # the variables keep the values of the last solve
+        return best if used is last else solve_problem(self.program, "CLARABEL", used)
 
     def _is_caused_by_settings(self, solver: str) -> bool:
         """Return whether a solver that raised an error raises none without the settings of the user."""

@@ -42,8 +42,10 @@ class ConicStatement:
         Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
     at_height : bool
         Whether the formulation itself keeps the exact height of the problem.
+    nowhere : str
+        The sentence for a program without any point, before changes.
     settings : mapping of str to float
-        Settings of Clarabel with which the method of the same name solves.
+        Settings of Clarabel.
     """
 
     program: Any
@@ -58,6 +60,7 @@ class ConicStatement:
     missing: Mapping[str, str] = field(default_factory=dict)
     within: str = ""
     at_height: bool = False
+    nowhere: str = "no point meets the posed problem"
     settings: Mapping[str, float] = field(default_factory=dict)
 
 

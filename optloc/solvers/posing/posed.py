@@ -326,7 +326,9 @@ class Posed(PosedProblem, ABC):
             fix = _of_pool(self.stated, np.full((1, self.stated.layout.size), np.nan), self._refinement)
             # a contradiction or a run to infinity is an answer of `optloc.solve` too
             if int(fix.code) not in (Status.NUMERICAL, int(code)):
-                text = f"the posed problem has no solution by {answer.backend}; the starts are of the method 'auto'"
+                failed = code == Status.NUMERICAL
+                why = f"the posed problem has no solution by {answer.backend}" if failed else reason
+                text = f"{why}; the starts are of the method 'auto'"
                 return replace(fix, reason=_joined(fix.reason, text), posed=replace(answer, refined=False))
         return self._failed(code, reason, answer)
 

@@ -155,7 +155,7 @@ class PosedConic(Posed):
         """Return the fix after a failure and its reason, from the outcome of the back end."""
         report = answer.backend
         if report.outcome == "infeasible":
-            text = f"no point meets the posed problem{self._changes()} {self.statement.within}".rstrip()
+            text = f"{self.statement.nowhere}{self._changes()} {self.statement.within}".rstrip()
             if self.statement.within:  # there may be points outside these limits, and the sentence names them
                 return self._failed(Status.INFEASIBLE, text, answer)
             return self._without_solution(Status.INFEASIBLE, text, answer, refine)
