@@ -37,10 +37,8 @@ class PosedProgram(Posed):
 
     Parameters
     ----------
-    stated : Problem
-        Flat batch of one problem.
-    formulation : str
-        Name of the formulation.
+    stated, formulation
+        As in `Posed`.
     scaled_problem : ScaledProblem
         The program without constraints, with its own symbols; of block averages for a long run.
     """

@@ -32,10 +32,8 @@ class PosedConic(Posed):
 
     Parameters
     ----------
-    stated : Problem
-        Flat batch of one problem.
-    formulation : str
-        Name of the formulation.
+    stated, formulation
+        As in `Posed`.
     statement : ConicStatement
         The convex problem.
     """

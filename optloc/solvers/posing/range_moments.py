@@ -86,7 +86,7 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
 
     given = height_sights(problem_at_rest(problem.straightened())) if one_position(problem) else None
     data = None if given is None else height_program(**given)
-    if data is None:
+    if given is None or data is None:
         raise InvalidProblem(
             "this formulation needs three ranges with a common unknown, and a known height", "formulation", 'use "nls"'
         )
@@ -105,7 +105,7 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
     return ConicStatement(
         program=program,
         size=data.size * WGS84_A**2,
-        origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])) if given else np.zeros(3),
+        origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])),
         unit=WGS84_A,
         parts={"position": shift + places @ lift[:, 0]},
         at_height=True,

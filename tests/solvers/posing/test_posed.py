@@ -62,13 +62,6 @@ def test_a_constraint_that_is_refused_leaves_nothing_behind():
 
 
 @pytest.mark.parametrize("formulation", ["hull", "nls"])
-def test_a_constraint_without_limits_has_no_duals(formulation):
-    posed = pose(ranged(1), formulation)
-    posed.add(constraints.band([1.0, 0.0], -np.inf, np.inf), name="none")
-    assert len(posed.solve().posed.duals["none"]) == 0
-
-
-@pytest.mark.parametrize("formulation", ["hull", "nls"])
 def test_refinement_is_a_choice(formulation):
     problem = ranged(2)
     posed = pose(problem, formulation)
