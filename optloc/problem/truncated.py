@@ -121,8 +121,11 @@ class Truncated:
         several = self._has_region | (finite.sum(-1) != 1)
         several = several | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
-            index = tuple(map(int, i)) if several.ndim else ()
-            mean[index], covariance[index] = take(self, index).moments_by_rays()
+            if several.ndim:
+                index = tuple(map(int, i))
+                mean[index], covariance[index] = take(self, index).moments_by_rays()
+            else:  # `region` is the function itself then, no array of functions
+                mean[...], covariance[...] = self.moments_by_rays()
         return mean, covariance
 
     def moments_by_rays(self) -> tuple[Array, Array]:

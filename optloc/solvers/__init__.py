@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from optloc.solvers.pool import Pool as Pool, begin as begin, offer as offer
     from optloc.solvers.posing.convex_program import ConvexProgram as ConvexProgram
     from optloc.solvers.posing.posed import Posed as Posed
+    from optloc.solvers.posing.posed_problem import PosedProblem as PosedProblem
     from optloc.solvers.posing.range_moments import range_rows as range_rows
     from optloc.solvers.prepared import Prepared as Prepared, prepare as prepare
     from optloc.solvers.robust.stage import rejected as rejected

@@ -110,7 +110,7 @@ def _chance(fix: Fix, i: tuple[int, ...], frame: Problem, position: Array, covar
     """Return the probability of the region for fix number i with its position (d,) and covariance (d, d)."""
     if fix.chart is None:
         points, weight = _gaussian(np.zeros_like(position), covariance).nodes()
-        return _share(frame, position + points, weight) if len(frame.constraints) else np.nan
+        return _share(frame, position + points, weight)
     chart = take(fix.chart, i)
     if chart.kind == CURVED:
         return np.nan

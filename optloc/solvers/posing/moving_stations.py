@@ -156,6 +156,7 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
         unit=scene.length,
         parts={"position": position, **_by_slot(problem.layout, rows.column, scene.unknown(lift))},
         residual=(scene.whiten @ (scene.rows / far[:, None])) @ lift[0],
+        at_height=surface is not None,
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
         settings=settings_of(),
