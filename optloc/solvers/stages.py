@@ -181,8 +181,8 @@ def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
     """Return a pool with more starts: mirror images, and starts of sub-arrays if the verdict has findings."""
     if pool is None:
         raise InvalidProblem("add_candidates needs a fix", "method", "put it after a refinement, as lsr+add_candidates")
-    if has_course(problem):
-        return in_parts(problem, lambda part, own: _more_courses(part, take(pool, own)), chunk_size(problem))
+    if is_registration_run(problem) or has_course(problem):
+        return _more_courses(problem, pool)
     if not one_position(problem):
         return pool
     return in_parts(problem, lambda part, own: _more_candidates(part, take(pool, own)), chunk_size(problem))
@@ -211,15 +211,16 @@ def _more_candidates(problem: Problem, pool: Pool) -> Pool:
 
 
 def _more_courses(problem: Problem, pool: Pool) -> Pool:
-    """Return the candidates of a refined pool of problems of one course, and additional starts to refine.
+    """Return the candidates of a refined pool of runs, and additional starts to refine.
 
-    Runs of ranges have starts beside weak fixes. Doubtful answers of all runs are searched from trial courses.
+    Runs of ranges have starts beside weak fixes. Courses whose answer is doubtful are searched from trial courses.
     """
     began, fix = perf_counter(), judge(problem, pool)
     x = step_beside(problem, fix.x, fix.covariance()) if is_registration_run(problem) else pool.x[:, :0]
-    doubtful = np.flatnonzero((fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)) & fix.answered)
-    if len(doubtful):
-        found = course_search(problem.take(doubtful))
+    # the search takes as long as all other stages, so it serves answers with a finding only
+    doubtful = np.flatnonzero(fix.answered & (fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)))
+    if len(doubtful) and has_course(problem):
+        found = course_search(problem.take(doubtful), fix.x[doubtful])
         spread = np.full((len(fix.x), *found.shape[1:]), np.nan)
         spread[doubtful] = found
         x = np.concatenate([x, spread], axis=1)

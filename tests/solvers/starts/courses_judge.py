@@ -134,17 +134,17 @@ def _measure(rng, kind, sparse, times, place, state, n):
     )
 
 
-def best(case, seed=0):
-    """Return the least cost of descents from the truth, around it, and from courses through random places."""
+def best(case, seed=0, drawn=DRAWN):
+    """Return the least cost of descents from the truth, around it, and from `drawn` courses anywhere, and its state."""
     rng, (terms, d) = np.random.default_rng(seed), case.truth.shape
     scale = np.array([600.0, 900.0 / case.span, 2000.0 / case.span**2])[:terms, None]
     near = case.truth + scale * rng.standard_normal((20, terms, d))
-    size = 1000.0 * np.exp(rng.normal(0.0, 0.8, (DRAWN, 1, 1)))
+    size = 1000.0 * np.exp(rng.normal(0.0, 0.8, (drawn, 1, 1)))
     wide = case.stations.mean(0) * (np.arange(terms) == 0)[:, None]
-    wide = wide + size * scale / 600.0 * rng.standard_normal((DRAWN, terms, d))
+    wide = wide + size * scale / 600.0 * rng.standard_normal((drawn, terms, d))
     wide[::4, 1:] = 0.0
     cost = np.array([(case.residual(x.ravel()) ** 2).sum() for x in wide])
-    chosen = np.concatenate([np.argsort(cost)[:CHEAPEST], rng.permutation(DRAWN)[:ANY]])
+    chosen = np.concatenate([np.argsort(cost)[:CHEAPEST], rng.permutation(drawn)[:ANY]]).astype(int)
     least, where = np.inf, None
     for x in np.concatenate([case.truth[None], near, wide[chosen]]):
         with np.errstate(all="ignore"):
