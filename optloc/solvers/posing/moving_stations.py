@@ -19,8 +19,8 @@ from optloc.solvers.starts.registration import place_states, run_of, run_starts,
 from optloc.solvers.starts.registration_windows import has_windows, windows_of
 
 _REACH = 10.0  # greatest distance of a source without a known height, as in `formulations.doppler_sdp.doppler`
-# Settings of Clarabel for the duals of runs. The method needs a start only, and keeps the default of 1e-8. With steps of
-# 0.99 iterates are so near the boundary of the cones that the value has six digits.
+# Settings of Clarabel for the duals of runs. The method needs a start only, and keeps the default of 1e-8. With steps
+# of 0.99 iterates are so near the boundary of the cones that the value has six digits.
 _FINE = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-9, "max_step_fraction": 0.8}
 
 
@@ -51,10 +51,7 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
         *(given[name] for name in ("station", "z", "whiten", "sigma", "design", "mean", "time"))
     )
     (K, S, d), order, b = data.station.shape, data.power.shape[1] - 1, len(data.prior)
-    # remainders less their biases, in deviations of the noise: otherwise the cost is a small difference of large numbers
-    fine = 1.0 / float(np.sqrt(np.einsum("kii->ki", data.gram).mean()))
-    change = np.zeros((S, b + S))
-    change[0, b], change[1:, :b], change[1:, b + 1 :] = 1.0, data.design, fine * np.eye(S - 1)
+    change = _less_biases(data)
     program = registration_problem(K, S, d, order, b, change)
     set_parameters(program, {**data.parameters(), "price": answers[0].price * data.weight})
     every = {one.name(): one for one in program.variables()}
@@ -77,11 +74,23 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
         origin=run.origin + run.length * data.origin,
         unit=run.length * data.scale,
         parts=parts,
-        residual=_window_residuals(data, every, fine),
+        residual=_window_residuals(data, every, change[-1, -1]),
         read=read,
         rank_ratio=lambda: largest_rank_ratio({name: one.value for name, one in every.items()}, K),
         settings=_FINE,
     )
+
+
+def _less_biases(data: Any) -> Array:
+    """Return the matrix (S, b + S) from biases, first range and remainders less their biases to range and remainders.
+
+    The new remainders are in deviations of the noise. With the old ones the cost is a small difference of large numbers.
+    """
+    rows, b = data.design.shape
+    fine = 1.0 / np.sqrt(np.einsum("kii->ki", data.gram).mean())
+    change = np.zeros((1 + rows, b + 1 + rows))
+    change[0, b], change[1:, :b], change[1:, b + 1 :] = 1.0, data.design, fine * np.eye(rows)
+    return change
 
 
 def _course(data: Any, target: Any, d: int, order: int) -> tuple[Any, Any]:
