@@ -84,7 +84,8 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
 def _less_biases(data: Any) -> Array:
     """Return the matrix (S, b + S) from biases, first range and remainders less their biases to range and remainders.
 
-    The new remainders are in deviations of the noise. With the old ones the cost is a small difference of large numbers.
+    The new remainders are in deviations of the noise. With the old remainders the cost would be a small difference of
+    large numbers.
     """
     rows, b = data.design.shape
     fine = 1.0 / np.sqrt(np.einsum("kii->ki", data.gram).mean())
