@@ -21,6 +21,7 @@ from optloc.files.roles import ColumnPlaces
 from optloc.files.settings import Units
 from optloc.files.table import Table
 from optloc.files.table_import import ColumnHints
+from optloc.models.layers import Layers
 
 # Relative spread of vp / vs in a table up to which its mean is used without a note: the rounding of two decimals.
 _EQUAL = 0.005
@@ -74,12 +75,17 @@ class Crust:
         """
         if self.speed is not None:
             return ()
-        surface = _STEP * ceil(max(highest, -self.depths[0]) / _STEP + 0.5)
-        depths = [0.0, *(depth + surface for depth in self.depths[1:])]
+        layers = self.layers(highest)
         return (
-            "", "[medium]", 'kind = "layers"', f"depths = {depths!r}", f"speeds = {[*self.speeds]!r}",
-            'between = "constant"', f"surface = {surface!r}",
+            "", "[medium]", 'kind = "layers"', f"depths = {[*layers.depth]!r}", f"speeds = {[*layers.speed]!r}",
+            'between = "constant"', f"surface = {layers.surface!r}",
         )  # fmt: skip
+
+    def layers(self, highest: float) -> Layers:
+        """Return the layers as a medium; the first extends upwards to all stations, the highest at `highest` metres."""
+        surface = _STEP * ceil(max(highest, -self.depths[0]) / _STEP + 0.5)
+        depths = (0.0, *(depth + surface for depth in self.depths[1:]))
+        return Layers(depths, self.speeds, "constant", surface)
 
 
 def crust_of(hints: ColumnHints, *, with_s: bool) -> Crust:
