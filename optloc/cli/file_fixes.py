@@ -77,12 +77,12 @@ class FileFixes:
 
 def _solve(problem: Problem, method: str, floors: Sequence[float]) -> Fix:
     """Return the fix of a problem; with `floors`, m, the best of the fixes at these heights."""
-    from optloc.solvers.floors import at_height, solve_on_floors
+    from optloc.solvers.floors import on_floors, solve_on_floors
     from optloc.solvers.solution import solve
 
     if not floors:
         return solve(problem, method=method)
-    return solve_on_floors([at_height(problem, height) for height in floors], method)
+    return solve_on_floors(on_floors(problem, floors), method)
 
 
 def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:

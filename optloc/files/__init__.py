@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     )
     from optloc.files.constraint_files import StatedConstraint as StatedConstraint
     from optloc.files.constraint_reader import limits_of as limits_of
-    from optloc.files.constraint_table import ConstraintTable as ConstraintTable
+    from optloc.files.constraint_table import ConstraintTable as ConstraintTable, height_table as height_table
     from optloc.files.convert import load_table as load_table
     from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (

@@ -189,7 +189,7 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
-    stated = f"exactly = {json.dumps(hints.height)}" if hints.height is not None else table_problem.height
+    stated = table_problem.height if hints.height is None else _stated_height(hints.height)
     return with_wave(replace(table_problem, height=stated), hints.wave)
 
 
@@ -354,6 +354,12 @@ def _plan(
         *([("not used", ", ".join(rest))] if rest else []),
     ]
     return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses, frame)
+
+
+def _stated_height(given: str) -> str:
+    """Return the line of a problem file for a height of the options, or for a list of heights."""
+    parts = [part.strip() for part in given.split(",")]
+    return f"exactly = {json.dumps(given)}" if len(parts) < 2 else f"one_of = {json.dumps(parts)}"
 
 
 def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str]:

@@ -124,8 +124,7 @@ def pick_rows(given: Mapping[str, Any], sigma: Any, unit: Any, places: Receivers
         raise InvalidProblem("P and S picks have different units", "unit", "convert them to seconds")
     alone = not isinstance(sigma, Mapping)
     scales = {
-        word: scale_of(word, units[word], sigma, [word] if alone else list(given), wave.speed, _AXES)
-        for word in given
+        word: scale_of(word, units[word], sigma, [word] if alone else list(given), wave.speed, _AXES) for word in given
     }
     values = _joined(found)
     step = next(scale for scale, _ in scales.values())

@@ -24,6 +24,7 @@ from optloc.files.constraint_reader import (
     constraints_of,
     demands_of,
     divided,
+    floors_of,
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
@@ -298,7 +299,8 @@ def assemble(
     problem, levels = with_noise(file, problem, source)
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
-    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words)
+    floors = floors_of(demands, problem.motions)
+    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words, floors=floors)
     moving = found.moving or _has_moving_target(problem)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 

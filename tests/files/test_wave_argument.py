@@ -103,11 +103,12 @@ def test_wind_moves_the_wave():
     line = np.array([*stations.values()]) - shot
     along, rest = line @ wind, speed**2 - wind @ wind
     times = (np.sqrt(along**2 + rest * (line**2).sum(1)) - along) / rest
-    fix = optloc.locate(stations, toa=dict(zip(stations, times)), sigma="1 ms", wave_speed=speed, wind=(6.0, -3.0))
+    toa = dict(zip(stations, times, strict=True))
+    fix = optloc.locate(stations, toa=toa, sigma="1 ms", wave_speed=speed, wind=(6.0, -3.0))
     assert np.abs(fix.position - shot).max() < 1e-3
     assert fix.status.label == "ok"
     compass = "6.7082039325 m/s from 296.56505118"  # from the west-north-west
-    same = optloc.locate(stations, toa=dict(zip(stations, times)), sigma="1 ms", wave_speed=speed, wind=compass)
+    same = optloc.locate(stations, toa=toa, sigma="1 ms", wave_speed=speed, wind=compass)
     assert np.abs(same.position - shot).max() < 1e-3
 
 
