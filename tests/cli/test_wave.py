@@ -132,9 +132,13 @@ def test_floors_in_tracks_files_and_sites(hall):
     records = [json.loads(line) for line in done.stdout.splitlines()]
     last = next(record for record in records if "position" in record)
     assert last["position"] == pytest.approx([5.0, 4.0, 1.2], abs=1e-3)
-    timed = json.dumps({"event": "1", "z": events[0]["z"], "time": 5.0})
-    (hall / "events.ndjson").write_text(timed + "\n")
-    assert "a track needs one height" in run(*words, "--track").stdout
+    rows = "".join(f'{{ a = "{k}", z = {math.dist((5.0, 4.0, 1.2), place)} }}, ' for k, place in ANCHORS.items())
+    text = (hall / "site.toml").read_text().split("[[measurements]]")[0]
+    (hall / "cart.toml").write_text(f'{text}[[measurements]]\nkind = "range"\nsigma = "5 cm"\nrows = [{rows}]\n')
+    z = [math.dist((5.0, 4.0, 1.2), place) for place in ANCHORS.values()]
+    (hall / "events.ndjson").write_text(json.dumps({"event": "1", "z": z, "time": 5.0}) + "\n")
+    done = run("live", "cart.toml", "--replay", "events.ndjson", "-q", "--height", "1.2 m, 6 m", "--track")
+    assert "a track needs one height" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(
