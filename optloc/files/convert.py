@@ -449,13 +449,17 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     it is a column. Times of arrival are stored relative to the first arrival of each message.
     """
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
-    values, text = found.values, found.form.text
+    values, text, after = found.values, found.form.text, list[str]()
     if found.form.kind == "toa":
+        timed = "time" in columns
         values, text = _from_first(found, columns), "arrivals, relative to the first of each message"
+        if not timed and "time" in columns:
+            after = [f'after = "{"date" if found.dated else "time"}"']
     columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": values}
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
+    lines += after
     lines += ["excess = true"] if found.form.value == "excess" else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):

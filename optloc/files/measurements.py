@@ -82,6 +82,8 @@ class RowChunk:
         For arrivals with a phase: the speed of P waves divided by the speed of S waves.
     combination : Combination, optional
         For combinations of such arrivals: the source of their noise.
+    after : "time" or "date", optional
+        For arrivals: z is seconds after the column time, or after the date that it contains.
     """
 
     kind: str
@@ -110,6 +112,7 @@ class RowChunk:
     declination: Array | None = None
     vp_vs: float | None = None
     combination: Combination | None = None
+    after: str | None = None
 
     @property
     def depends_on_speed(self) -> bool:
@@ -197,6 +200,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
         section.excess and _is_range_sum(model), table, day, vp_vs=section.vp_vs,
+        after=section.after if kind == "toa" else None,
     )  # fmt: skip
 
 
@@ -216,6 +220,9 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
         )
     if section.positive == "b-farther" and not _is_difference(model):
         raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
+    if section.after is not None and (kind != "toa" or not c.table.has("time")):
+        advice = 'use the kind "toa" with a column time, or remove the key'
+        raise InvalidProblem("after is for arrivals with a time", join(c.where, "key 'after'"), advice)
     if kind != "range" and (section.two_way or section.turn_around is not None):
         place = join(c.where, "key 'two_way'" if section.two_way else "key 'turn_around'")
         raise InvalidProblem(f"{kind} has no way back", place, "remove it; it is for range")

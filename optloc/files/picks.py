@@ -44,7 +44,8 @@ def read_picks(roles: Roles, hints: ColumnHints) -> Readings:
     values = Decimals.of([time for _, _, time, _ in picks])
     column = np.array([number for *_, number in picks])
     found = Readings(sort_named("picks"), "s", values, rows, headers, column, station[rows], notes=notes)
-    found = replace(found, phase=objects(waves))
+    dated = all(is_dated(table, header) for header in headers)
+    found = replace(found, phase=objects(waves), dated=dated)
     given = phase_sigmas(hints)
     if given is None:
         return found

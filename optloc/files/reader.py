@@ -28,6 +28,7 @@ from optloc.files.constraint_reader import (
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
+from optloc.files.emission_clock import EmissionClock, emission_clock
 from optloc.files.excess_paths import with_station_distance
 from optloc.files.measurements import (
     ESTIMATE,
@@ -100,6 +101,8 @@ class Loaded:
         Sentences on values that are physically suspicious.
     speed : str
         Wave speed, as text; empty if no value depends on it.
+    emission : EmissionClock, optional
+        Clock of the arrivals, for emission times; None without arrivals that are times.
     floors : tuple of float
         Heights, metres, on one of which the target is; empty without such a list.
     """
@@ -118,6 +121,7 @@ class Loaded:
     warnings: tuple[str, ...] = ()
     speed: str = ""
     floors: tuple[float, ...] = ()
+    emission: EmissionClock | None = None
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
@@ -300,7 +304,11 @@ def assemble(
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
     floors = floors_of(demands, problem.motions)
-    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words, floors=floors)
+    clock = emission_clock(chunks, index, numbers, all_biases, len(epochs.labels))
+    loaded = Loaded(
+        problem, source, file.title or source, *named, levels, units, azimuths, speed=words, floors=floors,
+        emission=clock,
+    )  # fmt: skip
     moving = found.moving or _has_moving_target(problem)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 

@@ -142,6 +142,8 @@ class MeasurementsTable(DataTable):
     """Whether ranges are times of the way there and back."""
     turn_around: Amount | None = None
     """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
+    after: Literal["time", "date"] | None = None
+    """For arrivals (toa): z is seconds after the column `time`; or after a date, the seconds since 1970 (UTC) in it."""
     vp_vs: float | None = Field(default=None, gt=1.0)
     """For arrivals (toa) with a column `phase`, P or S: speed of P waves, the propagation speed, divided by the speed
     of S waves. Rows of one epoch have one origin time."""
