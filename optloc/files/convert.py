@@ -397,7 +397,7 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
         if len({one.form.quantity for one in found}) > 1:
             advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
             raise InvalidProblem("the readings have several kinds, and each needs a sigma", "--sigma", advice)
-        return [hints.sigma] * len(found)
+        return [hints.sigma if one.sigma is None else None for one in found]
     given = sigmas_by_kind(hints.sigma)
     other = next((kind for kind in given if kind not in {one.form.kind for one in found}), None)
     if other is not None:
@@ -405,7 +405,7 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     lacking = next((one.form.kind for one in found if one.form.kind not in given and one.sigma is None), None)
     if lacking is not None:
         raise InvalidProblem(f"{lacking} has no sigma", "--sigma", f"add {lacking}=AMOUNT after a comma")
-    return [given.get(one.form.kind) for one in found]
+    return [given.get(one.form.kind) if one.sigma is None else None for one in found]
 
 
 def _with_waves(
