@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         ends_of as ends_of,
         sigma_of as sigma_of,
         values_of as values_of,
+        without_turn_around as without_turn_around,
     )
     from optloc.files.one_call import locate as locate
     from optloc.files.orbits import satellites as satellites

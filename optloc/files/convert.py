@@ -435,7 +435,7 @@ def _with_waves(
     notes.append(crust.note)
     if waves is not None:
         section = sections[0]
-        lines = (*section.lines, f"vp_vs = {crust.vp_vs!r}")
+        lines = (*section.lines, f"vp_vs = {crust.ratio}")
         sections = (replace(section, columns={**section.columns, "phase": waves}, lines=lines),)
     heights = stations.columns.get("height", stations.columns.get("z"))
     highest = 0.0 if heights is None else float(np.max(heights)) * UNITS["length"][stations.unit]

@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.types import Array, Bias
 from optloc.base.units import UNITS
 from optloc.files.measurements import RowChunk
+from optloc.models.phase_layers import S_TOA
 from optloc.problem.forms import form_of
 
 After = Literal["time", "date"]
@@ -60,7 +61,9 @@ def emission_clock(
     count : int
         Number of epochs k.
     """
-    arrivals = [(c, i, n) for c, i, n in zip(chunks, index, numbers, strict=True) if c.kind == "toa" and len(i)]
+    arrivals = [
+        (c, i, n) for c, i, n in zip(chunks, index, numbers, strict=True) if c.kind in ("toa", S_TOA) and len(i)
+    ]
     scaled = [bias.row for bias in biases if form_of(bias).enters == "scales"]
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, _, number in arrivals)])
     if not arrivals or np.isin(rows, np.concatenate([np.zeros(0, dtype=np.int64), *scaled])).any():

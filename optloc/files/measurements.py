@@ -79,7 +79,7 @@ class RowChunk:
     declination : array, optional
         Declination at that date at the stations of the present rows, radians; included in the corrections.
     vp_vs : float, optional
-        For arrivals with a phase: the speed of P waves divided by the speed of S waves.
+        For arrivals with a phase: the speed of P waves divided by the speed of S waves, or "layers".
     combination : Combination, optional
         For combinations of such arrivals: the source of their noise.
     after : "time" or "date", optional
@@ -110,7 +110,7 @@ class RowChunk:
     table: Table
     declined_on: date | None = None
     declination: Array | None = None
-    vp_vs: float | None = None
+    vp_vs: float | str | None = None
     combination: Combination | None = None
     after: str | None = None
 
@@ -178,7 +178,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     name = _unit(section, kind, c.where)
     unit = units.conversion(name, join(c.where, "key 'unit'"))
     if there_and_back:
-        unit = _without_turn_around(c, unit, units.name(name))
+        unit = without_turn_around(c, unit, units.name(name))
     weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
     z = values_of(c, unit, weight)
@@ -233,7 +233,7 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
             raise InvalidProblem(f"{kind} is not an azimuth", join(c.where, f"key {key!r}"), "remove the key")
 
 
-def _without_turn_around(c: Context, unit: Conversion, name: str) -> Conversion:
+def without_turn_around(c: Context, unit: Conversion, name: str) -> Conversion:
     """Return the conversion of two-way times to ranges: half of the time without the turn-around, times the speed.
 
     `unit` is the conversion of half of a time, and `name` the name of the unit. Raise InvalidProblem for a length, or

@@ -307,7 +307,9 @@ def _problem_of(
     if any(word in PICKS for word in given):
         picks = pick_rows(given, sigma, unit, places, wave)
         rows, joint, labels = [*picks.rows], picks.covariance, picks.labels
-    for word, values in given.items() if joint is None else ():
+    for word, values in given.items():
+        if word in PICKS:
+            continue
         speed = wave.range_speed if word == "ranges" else wave.speed
         found = station_values(word, values, places.names, reference)
         labels = found.labels if labels is None else labels

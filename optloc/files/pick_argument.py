@@ -16,7 +16,8 @@ from optloc.files.crust import Crust, crust_of
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_argument import Wave
 from optloc.models.layers import Layers
-from optloc.problem.build import Measured
+from optloc.models.phase_layers import S_TOA
+from optloc.problem.build import Measured, measured
 from optloc.problem.phases import phases
 
 PICKS = ("p", "s")
@@ -27,10 +28,13 @@ _AXES: Final = "east-counterclockwise"
 
 
 class PickRows(NamedTuple):
-    """Rows of picks with their joint covariance (m, m), square metres, and the labels of the epochs or None."""
+    """Rows of picks, their joint covariance (m, m), square metres, and the labels of the epochs or None.
+
+    The covariance is None if the rows have separate standard deviations.
+    """
 
     rows: tuple[Measured, ...]
-    covariance: Array
+    covariance: Array | None
     labels: list[Any] | None
 
 
@@ -141,6 +145,13 @@ def pick_rows(given: Mapping[str, Any], sigma: Any, unit: Any, places: Receivers
     deviation = np.repeat([deviation for _, deviation in scales.values()], count)[kept]
     _check_order(z[..., kept], station, is_s, places.names)
     ratio = None if wave.crust is None else wave.crust.vp_vs
+    if wave.crust is not None and wave.crust.s_speeds:
+        kinds = [(kind, np.flatnonzero(chosen)) for kind, chosen in (("toa", ~is_s), (S_TOA, is_s))]
+        parts = [(kind, pick) for kind, pick in kinds if len(pick)]
+        made = tuple(
+            measured(kind, z[..., kept][..., pick], a=station[pick], sigma=deviation[pick]) for kind, pick in parts
+        )
+        return PickRows(made, None, next(iter(found.values())).labels)
     # without S waves, the ratio has no effect
     rows, joint = phases(z[..., kept], a=station, is_s=is_s, ratio=ratio or 2.0, sigma=deviation)
     return PickRows(rows, joint, next(iter(found.values())).labels)

@@ -66,7 +66,8 @@ def hypo71(text: str, source: str) -> Table:
     notes = [f"picks with weight 4 are left out: {unused}"] if unused else []
     if weighted:
         notes.append(
-            f"{weighted} picks have weights 1 to 3: 3/4, 1/2 and 1/4 of full weight, so the sigma times 1.15, 1.41 and 2"
+            f"{weighted} picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight: "
+            "1.15, 1.41 and 2 times the sigma"
         )
     else:
         for each in rows:

@@ -16,6 +16,7 @@ from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable
 from optloc.files.settings import Units, join
 from optloc.files.wave_speed import StatedSpeed, stated_speed, wind_of
 from optloc.models.medium import Atmosphere, Layers, Medium, Wind
+from optloc.models.phase_layers import PhaseLayers
 from optloc.problem.bias import SPEED, scale_of
 
 NOT_STATED = f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)"
@@ -25,7 +26,7 @@ BOTH_WAYS = "a wind has almost no effect on the way there and back, and the mode
 
 # Keys of each kind of medium.
 _MEDIA = {
-    "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
+    "layers": ("depths", "speeds", "s_speeds", "between", "surface", "unit", "speed_unit"),
     "atmosphere": ("refractivity", "scale_height"),
 }
 
@@ -123,7 +124,10 @@ def medium_of(table: MediumTable, reference: float | None, place: str) -> Medium
             tuple(float(to_si(v)) for v in values or ())
             for to_si, values in ((length, table.depths), (speed, table.speeds))
         )
-        return Layers(depth, speeds, table.between, surface, reference)
+        if table.s_speeds is None:
+            return Layers(depth, speeds, table.between, surface, reference)
+        slow = tuple(float(speed(v)) for v in table.s_speeds)
+        return PhaseLayers(depth, speeds, table.between, surface, reference, slow)
     except InvalidProblem as error:
         raise InvalidProblem(error.what, place, error.advice) from None
 

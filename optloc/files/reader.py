@@ -39,7 +39,7 @@ from optloc.files.measurements import (
     square,
     with_declination,
 )
-from optloc.files.phase_rows import combined_noise, split_phases, unused_picks
+from optloc.files.phase_rows import check_layers, combined_noise, split_phases, unused_picks
 from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
@@ -288,6 +288,7 @@ def assemble(
     # Convert excess paths to path sums now, since the station positions are known.
     pairs = [(with_station_distance(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
+    check_layers(chunks, file.medium, source)
     chunks, index, target = split_phases(chunks, index, target, source)
     azimuths += declination_text(chunks) if azimuths else ""
     rows, numbers = _rows(chunks, index, target)

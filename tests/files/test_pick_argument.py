@@ -71,6 +71,29 @@ def test_layers_bend_the_rays_of_both_waves(tmp_path):
         assert np.abs(fix.position - QUAKE).max() < 30.0, fix
 
 
+def test_layers_with_two_ratios_have_separate_rays(tmp_path):
+    from optloc.models.layers import first_arrival
+    from optloc.models.phase_layers import PhaseLayers
+
+    file = tmp_path / "crust.csv"
+    file.write_text("depth km,vp km/s,vs km/s\n0,5,2.7\n3,6.5,3.75\n")
+    crust = PhaseLayers((0.0, 3e3), (5000.0, 6500.0), "constant", 0.0, None, (2700.0, 3750.0))
+    places = {name: (x, y, -10.0 - i) for i, (name, (x, y, _)) in enumerate(STATIONS.items())}
+
+    def arrivals(layers, names):
+        far = {name: np.array([np.hypot(places[name][0] - QUAKE[0], places[name][1] - QUAKE[1])]) for name in names}
+        return {
+            name: ORIGIN
+            + float(first_arrival(layers, far[name], np.array([6e3]), np.array([-places[name][2]])).time[0])
+            for name in names
+        }
+
+    fix = locate(
+        places, p=arrivals(crust, STATIONS), s=arrivals(crust.shear, "AA BB EE".split()), vp=str(file), sigma="10 ms"
+    )
+    assert np.abs(fix.position - QUAKE).max() < 30.0, fix
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

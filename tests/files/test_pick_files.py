@@ -86,7 +86,7 @@ def test_hypo71_phase_cards(tmp_path):
     assert error < 100.0
     table = read_table(tmp_path / "event.pha")
     assert table.notes[0] == "picks with weight 4 are left out: 1"
-    assert "picks have weights 1 to 3: 3/4, 1/2 and 1/4 of full weight" in table.notes[1]
+    assert "picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight" in table.notes[1]
 
 
 @pytest.mark.parametrize("sigma", ["0.05 s", "p=0.05 s,s=0.05 s", "toa=50 ms"])
