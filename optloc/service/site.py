@@ -436,10 +436,10 @@ def _check(draft: Draft, source: str) -> None:
     if motion - FREE:
         what = f"the motion {min(map(str, motion - FREE))} needs several epochs"
         raise InvalidProblem(what, join(source, "[target]"), "remove it; each event is fixed separately")
+    if any(section.vp_vs is not None for section in draft.file.measurements):
+        what = "a stream cannot use P and S arrivals with one origin time"
+        raise InvalidProblem(what, join(source, "key 'vp_vs'"), "remove it, and send P arrivals")
     for chunk in draft.chunks:
-        if chunk.combination is not None:
-            what = "a stream cannot use P and S arrivals with one origin time"
-            raise InvalidProblem(what, join(source, "key 'vp_vs'"), "remove it, and send P arrivals")
         if chunk.unit.logarithmic:
             where = join(chunk.table.source, "key 'unit'")
             raise InvalidProblem("a stream cannot use ratios in decibels", where, "send ratios, in the unit '1'")

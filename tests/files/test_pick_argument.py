@@ -81,16 +81,15 @@ def test_layers_with_two_ratios_have_separate_rays(tmp_path):
     places = {name: (x, y, -10.0 - i) for i, (name, (x, y, _)) in enumerate(STATIONS.items())}
 
     def arrivals(layers, names):
-        far = {name: np.array([np.hypot(places[name][0] - QUAKE[0], places[name][1] - QUAKE[1])]) for name in names}
-        return {
-            name: ORIGIN
-            + float(first_arrival(layers, far[name], np.array([6e3]), np.array([-places[name][2]])).time[0])
-            for name in names
-        }
+        found = {}
+        for name in names:
+            x, y, z = places[name]
+            across = np.array([np.hypot(x - QUAKE[0], y - QUAKE[1])])
+            found[name] = ORIGIN + float(first_arrival(layers, across, np.array([6e3]), np.array([-z])).time[0])
+        return found
 
-    fix = locate(
-        places, p=arrivals(crust, STATIONS), s=arrivals(crust.shear, "AA BB EE".split()), vp=str(file), sigma="10 ms"
-    )
+    p, s = arrivals(crust, STATIONS), arrivals(crust.shear, "AA BB EE".split())
+    fix = locate(places, p=p, s=s, vp=str(file), sigma="10 ms")
     assert np.abs(fix.position - QUAKE).max() < 30.0, fix
 
 

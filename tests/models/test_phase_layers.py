@@ -31,8 +31,17 @@ def quake(p, s, noise=0.0, seed=0):
     return assemble(NET, *rows, medium=CRUST)
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
-    ("p", "s"), [(range(6), range(4)), (range(4), range(3, 6)), ([], range(6)), (range(6), [])], ids=str
+    ("p", "s"),
+    [
+        pytest.param(range(6), range(4), marks=SLOW, id="both"),
+        pytest.param(range(4), range(3, 6), marks=SLOW, id="S of other stations"),
+        pytest.param([], range(6), id="S alone"),
+        pytest.param(range(6), [], id="P alone"),
+    ],
 )
 def test_exact_picks_give_the_focus(p, s):
     fix = optloc.solve(quake(list(p), list(s)))
@@ -40,6 +49,7 @@ def test_exact_picks_give_the_focus(p, s):
     assert float(fix.cost) < 1e-3
 
 
+@pytest.mark.slow
 def test_errors_are_of_the_size_of_their_deviations():
     score = []
     for seed in range(6):
