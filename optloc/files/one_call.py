@@ -209,7 +209,7 @@ def locate(
         both. Other measurements are then not allowed.
     vp, vs : float, str or Layers, optional
         Speeds of P and S waves, such as "6 km/s"; or `vp` is the file of a table of layers, or a medium of constant
-        layers, and `vs` a ratio such as "vp/1.73".
+        layers, and `vs` a ratio such as "vp/1.73". A medium `PhaseLayers` has both speeds.
     wind : str or sequence of float, optional
         Velocity of the medium: "5 m/s from 270" (from the west), or towards the axes x and y, m/s. East and north for
         stations on Earth.

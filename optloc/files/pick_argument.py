@@ -16,7 +16,7 @@ from optloc.files.crust import Crust, crust_of
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_argument import Wave
 from optloc.models.layers import Layers
-from optloc.models.phase_layers import S_TOA
+from optloc.models.phase_layers import S_TOA, PhaseLayers
 from optloc.problem.build import Measured, measured
 from optloc.problem.phases import phases
 
@@ -69,6 +69,10 @@ def wave_of_picks(vp: Any, vs: Any, wave: Wave, given: Mapping[str, Any]) -> Wav
         raise InvalidProblem("picks have the speeds vp and vs", "wave_speed", "give vp= and vs= instead")
     if vp is None:
         raise InvalidProblem("the speed of the P waves is unknown", "vp", "state it, such as vp='6 km/s'")
+    if isinstance(vp, PhaseLayers):
+        if vs is not None:
+            raise InvalidProblem("the layers have the speeds of S waves", "vs", "remove this argument")
+        return Wave(vp.unit_speed, medium=vp, crust=Crust(None, vp.unit_speed, s_speeds=vp.s_speed))
     if isinstance(vp, Layers):
         ratio = crust_of(ColumnHints(vp="1 m/s", vs=_vs_of_ratio(vs)), with_s=True).vp_vs if "s" in picks else None
         return Wave(vp.unit_speed, medium=vp, crust=Crust(ratio, vp.unit_speed))

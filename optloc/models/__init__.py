@@ -21,7 +21,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Registry
 from optloc.base.units import UNITS
 from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, Wind as Wind, arrival, path, path_rate
-from optloc.models.phase_layers import S_TOA, shear_path
+from optloc.models.phase_layers import S_TOA, PhaseLayers as PhaseLayers, shear_path
 from optloc.models.primitives import (
     Components,
     Point,

@@ -89,8 +89,11 @@ def test_layers_with_two_ratios_have_separate_rays(tmp_path):
         return found
 
     p, s = arrivals(crust, STATIONS), arrivals(crust.shear, "AA BB EE".split())
-    fix = locate(places, p=p, s=s, vp=str(file), sigma="10 ms")
-    assert np.abs(fix.position - QUAKE).max() < 30.0, fix
+    for vp in (str(file), crust):
+        fix = locate(places, p=p, s=s, vp=vp, sigma="10 ms")
+        assert np.abs(fix.position - QUAKE).max() < 30.0, fix
+    with pytest.raises(InvalidProblem, match="the layers have the speeds of S waves"):
+        locate(places, p=p, s=s, vp=crust, vs="vp/1.73", sigma="10 ms")
 
 
 @pytest.mark.parametrize(
