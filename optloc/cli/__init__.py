@@ -55,7 +55,7 @@ if TYPE_CHECKING:
         write_text as write_text,
     )
     from optloc.cli.track import TrackOptions as TrackOptions, dynamics_of as dynamics_of, rules as rules
-    from optloc.cli.wave import WaveSpeed as WaveSpeed
+    from optloc.cli.wave import TurnAround as TurnAround, TwoWay as TwoWay, WaveSpeed as WaveSpeed, Wind as Wind
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

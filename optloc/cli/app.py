@@ -54,7 +54,6 @@ from optloc.cli.options import (
     constraints,
     example,
     find_problem,
-    floors_of,
     name_in,
     run_process,
 )
@@ -160,9 +159,7 @@ def fix(
     """
     from optloc.cli.fix import run_fix
 
-    floors = floors_of(height)
-    one = f"{floors[0]!r} m" if floors else height
-    more, passing = constraints(one, above_ground, box, constraint or ()), allowed(allow)
+    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
         file,
@@ -177,7 +174,6 @@ def fix(
         explain=explain,
         allow=passing,
         table=table_hints(file, given),
-        floors=floors,
     )
     raise typer.Exit(code)
 

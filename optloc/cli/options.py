@@ -326,7 +326,7 @@ Height = Annotated[
         "--height",
         metavar="H",
         help="Known height above the ellipsoid, or along z of a frame that is not on Earth: 500, or '1640 ft'. "
-        "[bold]optloc fix[/bold] also takes a list of floors: '0 m, 3.5 m, 7 m'.",
+        "A list has the floors on one of which the target is: '0 m, 3.5 m, 7 m'.",
     ),
 ]
 AboveGround = Annotated[bool, typer.Option("--above-ground", help="The target is above the ellipsoid.")]
@@ -422,14 +422,12 @@ def constraints(
     texts : sequence of str
         Further constraints, such as ``disc x=3 km y=2 km radius=500 m``.
     """
-    from optloc.files.constraint_table import ConstraintTable, constraint_of_text  # the help needs no schema
+    # the help needs no schema
+    from optloc.files.constraint_table import ConstraintTable, constraint_of_text, height_table
 
     found = {}
-    if height is not None and "," in height:
-        advice = "state one height; a list of floors is for optloc fix"
-        raise InvalidProblem(f"{height!r} has several heights", "--height", advice)
     if height is not None:
-        found["--height"] = ConstraintTable(kind="height", exactly=height)
+        found["--height"] = height_table(height)
     if above_ground:
         found["--above-ground"] = ConstraintTable(kind="above-ground")
     if box is not None:
@@ -443,19 +441,6 @@ def constraints(
         place = "--constraint" if len(texts) == 1 else f"--constraint {i + 1}"
         found[place] = constraint_of_text(text, place)
     return found
-
-
-def floors_of(height: str | None) -> tuple[float, ...]:
-    """Return the heights of a list such as "0 m, 3.5 m, 7 m", metres; empty for one height or none.
-
-    Raise InvalidProblem for a part that is not a height.
-    """
-    parts = [] if height is None else [part.strip() for part in height.split(",")]
-    if len(parts) < 2:
-        return ()
-    from optloc.files.settings import Units
-
-    return tuple(Units("length").plain(part, "m", "--height") for part in parts)
 
 
 # Station placement.

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     )
     from optloc.solvers.certificates.admitted import certify as certify
     from optloc.solvers.certificates.relaxations import Reference as Reference, reference_bound as reference_bound
+    from optloc.solvers.floors import PreparedFloors as PreparedFloors, prepare_on_floors as prepare_on_floors
     from optloc.solvers.methods import (
         FORMULATIONS as FORMULATIONS,
         METHODS as METHODS,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from optloc.engine import numbers
-from optloc.files import positive_speed, stated_speed
+from optloc.files import Units, positive_speed, stated_speed
 from optloc.models import MODELS, kind_named
 from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, check_once, nearest
 
@@ -170,6 +170,8 @@ def network_of(
     distances: Sequence[tuple[int, int, float, float]] = (),
     labels: Sequence[str] | None = None,
     wave_speed: Amount | None = None,
+    two_way: bool = False,
+    turn_around: Amount | None = None,
 ) -> Network:
     """Return a network with one kind of measurements.
 
@@ -199,6 +201,10 @@ def network_of(
         Names of the pulses.
     wave_speed : float or str, optional
         Wave speed, m/s or text such as "air:20C". If it is given, `z` and `sigma` are times in seconds.
+    two_way : bool
+        Whether ranges are times of the way there and back; needs `wave_speed`.
+    turn_around : float or str, optional
+        Time between arrival and reply at the other end, seconds or text such as "2 ms", for two-way times.
 
     Returns
     -------
@@ -212,6 +218,15 @@ def network_of(
     """
     kind = kind_named(kind)
     metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed")
+    if two_way or turn_around is not None:
+        if kind != "range" or wave_speed is None:
+            what = f"{kind} has no way back" if kind != "range" else "two-way ranges are times, which need a wave speed"
+            advice = 'remove this argument; it is for kind="range"' if kind != "range" else 'add wave_speed="air:20C"'
+            raise InvalidProblem(what, "two_way" if two_way else "turn_around", advice)
+        pause = 0.0 if turn_around is None else Units("time").plain(turn_around, "s", "turn_around")
+        if not pause >= 0.0:
+            raise InvalidProblem("the turn-around time is negative", "turn_around", 'write it as "2 ms"')
+        metres, z = 0.5 * metres, np.asarray(z, dtype=float) - pause
     z, sigma = metres * np.asarray(z, dtype=float), metres * np.asarray(sigma, dtype=float)
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
