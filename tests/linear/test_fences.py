@@ -386,3 +386,14 @@ def test_a_fence_fits_its_problem():
     problem = replace(fenced(z), constraints=constraints.fence(NORMAL, 1.0, 1.0))
     assert problem.constraints == ()
     assert isinstance(problem.fences[0], Fence)
+
+
+def test_a_fence_alone_can_have_the_batch_axis():
+    rng = np.random.default_rng(3)
+    place = rng.uniform(-100.0, 100.0, (6, 2))
+    rows = measured("range", np.linalg.norm(place - [10.0, 20.0], axis=1), a=np.arange(6), sigma=3.0)
+    offsets = np.array([8.0, -4.0])
+    both = solve(assemble(place, rows, constraints=constraints.fence((1.0, 0.0), offsets, 2.0)))
+    for one, offset in zip(both.position, offsets, strict=True):
+        alone = solve(assemble(place, rows, constraints=constraints.fence((1.0, 0.0), float(offset), 2.0)))
+        assert one == pytest.approx(alone.position, abs=1e-6)

@@ -55,6 +55,8 @@ def test_wrong_winds_are_refused():
         Wind((200.0, 0.0), 340.0)
     with pytest.raises(InvalidProblem, match="has 1 components"):
         Wind((2.0,), 340.0)
+    with pytest.raises(InvalidProblem, match="has 1 components"):
+        Wind(340.0, (2.0, 0.0))
     places = {"A": (0, 0), "B": (9, 0), "C": (0, 9), "D": (9, 9)}
     with pytest.raises(InvalidProblem, match="the stations have two"):
         locate(places, ranges=dict.fromkeys(places, 6.0), sigma=0.1, wave_speed=Wind((1.0, 0.0, 0.0), 340.0))

@@ -31,6 +31,9 @@ def box(
         Name in reports, before the name of the axis.
     """
     d = len(lower)
+    if d != len(upper) or d > len("xyz"):
+        what = f"the box has {d} lower and {len(upper)} upper limits"
+        raise InvalidProblem(what, name or "box", "give two or three of each, infinite for none")
     return tuple(
         Band("plane", metres(low, "box"), metres(high, "box"), np.eye(d)[i], f"{name} {'xyz'[i]}".strip(), target)
         for i, (low, high) in enumerate(zip(lower, upper, strict=True))
