@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cache, partial
 from inspect import signature
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -23,8 +23,10 @@ from optloc.solvers.starts.squared_range import hull, last_weighting, shor
 
 # Steps of the difference quotient, in standard deviations of the position: large where the value has few digits, and
 # small where it has kinks. The first step is of the formulation; the others serve if two quotients disagree.
-STEPS = {"nls": 1e-3, "minimax_cone": 1e-2, "registration_sdp": 0.3}
+STEPS = {"nls": 1e-3, "minimax_cone": 1e-2, "registration_sdp": 1.0}
 STEP, OTHERS = 0.05, (0.5, 0.01, 0.1)
+# Formulations whose value has so few digits that steps are large, and quotients are extrapolated once more.
+COARSE = ("registration_sdp",)
 # Two quotients that differ by less, relative to their size, are near the derivative.
 AGREE = 5e-5
 # Smaller steps than this one, in standard deviations, do not bound a dual: the value has too few digits.
@@ -120,10 +122,14 @@ def dual_error(formulation, at, unit, sigma):
     dual, natural = here.duals["fence"] * unit, 0.0 if formulation in IN_METRES else 1.0
     tried = (STEPS.get(formulation, STEP), *OTHERS)
     for step in tried:
-        quotient = [-(at(h).value - at(-h).value) / (2.0 * h) * slope for h in (step, 0.5 * step)]
+        halves = [step * 0.5**k for k in range(3 if formulation in COARSE else 2)]
+        quotient, order = [-(at(h).value - at(-h).value) / (2.0 * h) * slope for h in halves], 4.0
         size = max(abs(quotient[0]), natural + abs(here.value))
+        while len(quotient) > 2:
+            quotient = [(order * b - a) / (order - 1.0) for a, b in pairwise(quotient)]
+            order *= 4.0
         if abs(quotient[0] - quotient[1]) < AGREE * size:
-            return abs(dual - (4.0 * quotient[1] - quotient[0]) / 3.0) / size, True
+            return abs(dual - (order * quotient[1] - quotient[0]) / (order - 1.0)) / size, True
     if formulation == "nls":  # its optimum is no convex function of the offset
         return np.nan, False
     wide = [h for step in tried for h in (step, 0.5 * step) if h >= WIDE]

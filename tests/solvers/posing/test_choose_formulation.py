@@ -91,8 +91,9 @@ def test_duals_that_were_wrong(formulation, seed):
 
 
 @pytest.mark.slow
-def test_duals_of_moments_that_were_wrong():
-    assert failures([record("moment_sdp", 3003)]) == []
+@pytest.mark.parametrize(("formulation", "seed"), [("moment_sdp", 3003), ("registration_sdp", 3055)])
+def test_duals_of_slow_formulations_that_were_wrong(formulation, seed):
+    assert failures([record(formulation, seed)]) == []
 
 
 def test_ranges_and_a_height_that_no_point_fits_have_a_sentence():
