@@ -21,6 +21,7 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.base.frames import CARTESIAN
 from optloc.base.records import overwrite, take
 from optloc.base.types import Array, Band, Rows
 from optloc.linear.normal import prior_parts
@@ -29,7 +30,7 @@ from optloc.models.medium import Wind
 from optloc.problem.claims import Claims
 from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
-from optloc.problem.problem import CARTESIAN, Problem
+from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import (
     LOST,
     certify_stage,
