@@ -57,7 +57,7 @@ def emission_clock(
     index, numbers : sequence of int array (m,)
         Epoch and global number of the rows of each chunk.
     biases : sequence of Bias
-        Biases of the problem. A scale of arrivals changes their clock, so there is none.
+        Biases of the problem. A scale of arrivals changes their clock, so the result is None.
     count : int
         Number of epochs k.
     """

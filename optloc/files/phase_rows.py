@@ -82,7 +82,7 @@ def _separate(chunk: RowChunk) -> list[tuple[RowChunk, Array]]:
             continue
         names = ("row", "z", "a", "b", "weight", "correction", "slope", "baseline", "sigma", "label", "time", "written")
         columns = {name: getattr(chunk, name) for name in (*names, "target")}
-        taken = {name: None if column is None else column[rows] for name, column in columns.items()}
+        taken: dict[str, Any] = {name: None if column is None else column[rows] for name, column in columns.items()}
         parts.append((replace(chunk, kind=kind, vp_vs=None, **taken), rows))
     return parts
 

@@ -124,7 +124,7 @@ def pick_rows(given: Mapping[str, Any], sigma: Any, unit: Any, places: Receivers
     Raises
     ------
     InvalidProblem
-        If an S wave is not after the P wave of its station, or if events of a batch have picks at other stations.
+        If an S wave is not after the P wave of its station. If events of a batch have picks at other stations.
     """
     found = {word: station_values(word, values, places.names, None) for word, values in given.items()}
     units = {word: per_word(unit, word, given, "unit") or found[word].unit or ARGUMENTS[word].unit for word in given}

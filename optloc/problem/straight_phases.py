@@ -14,8 +14,8 @@ from optloc.models.phase_layers import PhaseLayers
 def straight_s_rows(s: Rows, others: Sequence[Rows], medium: PhaseLayers) -> Rows:
     """Return arrival times of S waves as rows with straight rays at mean speeds; the rows keep their order.
 
-    An S wave with a P wave of the same station gives a range, because the difference of both times does not contain the
-    origin time. Without any P wave, the rows are arrival times. Other S waves get the weight 0.
+    The difference of S and P waves of one station does not contain the origin time, so it gives a range. Without any P
+    wave, the rows are arrival times. Other S waves get the weight 0.
 
     Parameters
     ----------

@@ -298,7 +298,9 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     elif moves_at_once(problem):
         pool = _search_unanswered(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
     if has_course(problem):
-        pool = _search_unanswered(problem, pool, course_search, partial(_searched, tried=f"{TRIALS} courses"))
+        # only a candidate far away shows that the cost at infinity is small
+        courses = partial(_searched, tried=f"{TRIALS} courses")
+        pool = _search_unanswered(problem, pool, course_search, courses, keeps=True)
     if one_position(problem):
         positions = partial(_searched, tried=f"{_PLACES} positions")
         pool = _search_unanswered(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), positions)
@@ -306,12 +308,16 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def _search_unanswered(
-    problem: Problem, pool: Pool, starts: Callable[[Problem], Array], fields_from: Callable[[Array], dict[str, Any]]
+    problem: Problem,
+    pool: Pool,
+    starts: Callable[[Problem], Array],
+    fields_from: Callable[[Array], dict[str, Any]],
+    keeps: bool = False,
 ) -> Pool:
     """Return a pool whose unanswered problems start again; problems without a better result keep their old pool.
 
     `starts` maps the unanswered problems to starts (n, q, size). `fields_from` maps the earlier reasons of their fixes
-    to fields of the new pool.
+    to fields of the new pool. If `keeps` is true, the old candidates compete with the starts.
     """
     fix = judge(problem, pool)
     # if the Earth hides all known minima, another minimum may be visible
@@ -328,8 +334,9 @@ def _search_unanswered(
     if not len(items):
         return pool
     began = perf_counter()
-    part = problem.take(items)
-    found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
+    part, before = problem.take(items), take(pool, items)
+    x = pack(np.concatenate([before.x, starts(part)], axis=1)) if keeps else starts(part)
+    found = lsr(part, offer(part, x, before, "search", began))
     new_fix = judge(part, found)
     # a minimum with a finding is better than a missing start
     better = np.isin(fix.code[items], _STARTLESS) & ~np.isin(new_fix.code, _STARTLESS)

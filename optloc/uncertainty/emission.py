@@ -33,7 +33,8 @@ def emissions(problem: Problem, fix: Fix) -> tuple[Array, Array]:
     if slot is None or not len(items):
         return found[0], found[1]
     part = problem.take(items)
-    part = part.with_rows(weight=np.broadcast_to(flat.weights[items], (len(items), part.count)))
+    # Fixes of epochs with different numbers of rows have weights of equal length, with the unused ones at the end.
+    part = part.with_rows(weight=flat.weights[items][:, : part.count])
     x = flat.x[items]
     equations = with_priors(part, x, normal(linearise(part, x), k))
     covariance = local_covariance(equations, flat.cov[items], layout.n_local)

@@ -88,3 +88,12 @@ def test_the_key_needs_arrivals_with_a_time(folder):
     )
     with pytest.raises(InvalidProblem, match="after is for arrivals with a time"):
         read(folder / "p.toml")
+
+
+def test_messages_at_different_numbers_of_stations_have_their_origins(folder):
+    heard = {1: "ABCD", 2: "ABCDE", 3: "BCDE"}
+    lines = [f"{i},{name},{20 * i + delay(name, 0.34):.6f}\n" for i, names in heard.items() for name in names]
+    (folder / "t.csv").write_text("message,station,toa_s\n" + "".join(lines))
+    hints = ColumnHints(stations=folder / "st.csv", sigma="10 ms", wave=waves_of("340 m/s"))
+    found = fix_file(interpret_table(folder / "t.csv", hints).read({}), "auto", True)
+    assert found.columns["emission_s"] == pytest.approx([20.0, 40.0, 60.0], abs=1e-3)

@@ -219,14 +219,7 @@ def network_of(
     kind = kind_named(kind)
     metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed")
     if two_way or turn_around is not None:
-        if kind != "range" or wave_speed is None:
-            what = f"{kind} has no way back" if kind != "range" else "two-way ranges are times, which need a wave speed"
-            advice = 'remove this argument; it is for kind="range"' if kind != "range" else 'add wave_speed="air:20C"'
-            raise InvalidProblem(what, "two_way" if two_way else "turn_around", advice)
-        pause = 0.0 if turn_around is None else Units("time").plain(turn_around, "s", "turn_around")
-        if not pause >= 0.0:
-            raise InvalidProblem("the turn-around time is negative", "turn_around", 'write it as "2 ms"')
-        metres, z = 0.5 * metres, np.asarray(z, dtype=float) - pause
+        metres, z = _one_way(kind, z, metres, two_way, turn_around, stated=wave_speed is not None)
     z, sigma = metres * np.asarray(z, dtype=float), metres * np.asarray(sigma, dtype=float)
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
@@ -265,6 +258,25 @@ def network_of(
         tuple(labels) if labels is not None else tuple(str(j) for j in range(len(values))),
     )
     return checked(made)
+
+
+def _one_way(
+    kind: str, z: Any, metres: float, two_way: bool, turn_around: Amount | None, *, stated: bool
+) -> tuple[float, Array]:
+    """Return the metres of a second of two-way times, and the times `z` without the turn-around time, seconds.
+
+    `metres` is the wave speed, and `stated` is whether it is stated. Raise InvalidProblem for other kinds than ranges.
+    """
+    where = "two_way" if two_way else "turn_around"
+    if kind != "range":
+        raise InvalidProblem(f"{kind} has no way back", where, 'remove this argument; it is for kind="range"')
+    if not stated:
+        what = "two-way ranges are times, which need a wave speed"
+        raise InvalidProblem(what, where, 'add wave_speed="air:20C"')
+    pause = 0.0 if turn_around is None else Units("time").plain(turn_around, "s", "turn_around")
+    if not pause >= 0.0:
+        raise InvalidProblem("the turn-around time is negative", "turn_around", 'write it as "2 ms"')
+    return 0.5 * metres, np.asarray(z, dtype=float) - pause
 
 
 def checked(made: Network) -> Network:

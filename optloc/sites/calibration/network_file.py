@@ -131,10 +131,7 @@ def read_network(
     )
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _prior_places(file.stations, table, where)
-    if (two_way or turn_around is not None) and all(section.kind != "range" for section in file.measurements):
-        raise InvalidProblem(
-            "the file has no ranges", "--two-way" if two_way else "--turn-around", "remove this option"
-        )
+    _check_ways(file, two_way=two_way, turn_around=turn_around)
     rows: list[tuple[str, Array, Array, Array, Array, Array]] = []
     apart: list[tuple[Array, Array, Array, Array]] = []
     for i, section in enumerate(file.measurements):
@@ -201,6 +198,13 @@ def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[A
 def _optional_column(table: Table, key: str) -> Array:
     """Return a column as numbers (q,), NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
+
+
+def _check_ways(file: NetworkFile, *, two_way: bool, turn_around: str | None) -> None:
+    """Raise InvalidProblem for options of two-way times if the file has no ranges."""
+    if (two_way or turn_around is not None) and all(section.kind != "range" for section in file.measurements):
+        option = "--two-way" if two_way else "--turn-around"
+        raise InvalidProblem("the file has no ranges", option, "remove this option")
 
 
 def _ways(

@@ -1,9 +1,11 @@
 """Proofs of fixes in a steady wind: a linear map of the positions gives an equal problem with straight rays at rest.
 
-Let r point from target to station, c be the wave speed, w the wind, m = w / c and q = 1 - m'm. The travel time times
-c, from `optloc.models.wind`, is
+Let r point from target to station. Let c be the wave speed, w the wind, m = w / c and q = 1 - m'm.
+`optloc.models.wind` gives the travel time times c:
 
-    f = (sqrt((m'r)^2 + q r'r) - m'r) / q = |L r| - k'r,  k = m / q,  L L = (m m' + q I) / q^2.
+    f = (sqrt((m'r)^2 + q r'r) - m'r) / q = |L r| - k'r;
+
+k is m / q, and L is symmetric with L L = (m m' + q I) / q^2.
 
 In the coordinates y = L x, the first term is a range. The second term is a constant of the station and a linear
 function of the position. Differences of arrivals do not contain the linear function. For arrival times, it is a part of
@@ -21,6 +23,7 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.base.frames import CARTESIAN
 from optloc.base.records import overwrite, take
 from optloc.base.types import Array, Band, Rows
 from optloc.linear.normal import prior_parts
@@ -29,7 +32,7 @@ from optloc.models.medium import Wind
 from optloc.problem.claims import Claims
 from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
-from optloc.problem.problem import CARTESIAN, Problem
+from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import (
     LOST,
     certify_stage,

@@ -96,7 +96,7 @@ def _search(problem: Problem, known: Array, thinned: bool) -> Array:
 
 def _some_epochs(problem: Problem) -> Problem:
     """Return some epochs of a long run as a run; a short run is returned unchanged."""
-    # epochs enough for a course that accelerates, also if an epoch has very many rows
+    # epochs enough for a course that accelerates, also if an epoch has hundreds of rows
     kept = max(_ROWS * problem.epochs // max(problem.count, 1), 8)
     if kept >= problem.epochs:
         return problem

@@ -66,6 +66,12 @@ def test_an_accelerating_course_that_was_refuted_is_found():
     np.testing.assert_allclose(fix.cost, judge.best(case)[0], rtol=1e-6)
 
 
+def test_a_search_keeps_that_a_target_at_infinity_fits():
+    # the refused answer is at infinity; the search finds a place at the same cost, which is no answer by itself
+    fix = solve(judge.draw("tdoa/2/1/full/far", 35).problem)
+    assert fix.status == Status.UNBOUNDED
+
+
 @pytest.mark.full
 def test_no_fitting_course_is_refuted_in_full():
     found, count = misses(range(5000, 5050))
