@@ -47,7 +47,14 @@ def table(head: str, rows: Sequence[Sequence[object]]) -> str:
     return "\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n"
 
 
-MICS = {"Depot": (0, 0), "School": (62, 8), "Church": (18, 54), "Bridge": (76, 69), "Park": (-31, 38), "Mill": (35, -29)}
+MICS = {
+    "Depot": (0, 0),
+    "School": (62, 8),
+    "Church": (18, 54),
+    "Bridge": (76, 69),
+    "Park": (-31, 38),
+    "Mill": (35, -29),
+}
 HALL = {"A": (0, 0, 3), "B": (24, 1, 2.5), "C": (25, 16, 3.2), "D": (-1, 15, 2.2), "E": (12, 8, 5)}
 NET = {
     "AQU": (42.354, 13.405, 710),
@@ -106,7 +113,13 @@ def tag() -> Case:
 
 def vehicle() -> Case:
     """Return two-way times of a vehicle and five transponders, in milliseconds."""
-    places = {"T1": (0, 0, -61), "T2": (420, 30, -64), "T3": (390, 350, -58), "T4": (-40, 380, -60), "T5": (180, 170, -52)}
+    places = {
+        "T1": (0, 0, -61),
+        "T2": (420, 30, -64),
+        "T3": (390, 350, -58),
+        "T4": (-40, 380, -60),
+        "T5": (180, 170, -52),
+    }
     there = 2e3 * far(places, (120, 140, -25)) / WATER + 15.0
     files = {
         "t.csv": table("station,tof_ms", [(name, f"{t:.3f}") for name, t in zip(places, there, strict=True)]),
@@ -263,9 +276,7 @@ def broken() -> list[Case]:
         # slant ranges in a plane
         replace(f, name="slant ranges", files={**f.files, "t.csv": h.files["t.csv"]}),
         _scaled(f, "ranges of a plane in millimetres", 1e3),
-        f.changed("anchors on a line", "24,1", "24,0", file="s.csv").changed(
-            "two anchors", "C,", "A,", file="s.csv"
-        ),
+        f.changed("anchors on a line", "24,1", "24,0", file="s.csv").changed("two anchors", "C,", "A,", file="s.csv"),
         # a track
         t.called("track without sigma", without=["--sigma"]),
         t.called("track of an unknown model", "--model", "bus"),
