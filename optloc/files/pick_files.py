@@ -58,9 +58,11 @@ def hypo71(text: str, source: str) -> Table:
                 continue
             weighted += weight in ("1", "2", "3")
             rows.append({"event": event, **row})
-    notes = [f"picks with weight 4 are left out: {unused}"] if unused else []
+    notes = [f"picks with weight 4 are left out: {unused}; change their weight to use them"] if unused else []
     if weighted:
-        notes.append(f"weights 1 to 3 are not used, so all picks have the stated sigma: {weighted} picks")
+        notes.append(
+            f"weights 1 to 3 of {weighted} picks are not used; --sigma 'p=0.05 s,s=0.1 s' states a sigma for each wave"
+        )
     return _table(rows, source, notes)
 
 
@@ -129,7 +131,11 @@ def nonlinloc(text: str, source: str) -> Table:
             continue
         sigma = error if error > 0.0 and cells[9] == "GAU" else None
         rows.append({"event": event, "station": cells[0], "phase": cells[4], "time": time, "sigma_s": sigma})
-    return _table(rows, source, [f"picks with prior weight 0 are left out: {unused}"] if unused else [])
+    return _table(
+        rows,
+        source,
+        [f"picks with prior weight 0 are left out: {unused}; change their weight to use them"] if unused else [],
+    )
 
 
 def quakeml(text: str, source: str) -> Table:
@@ -161,7 +167,11 @@ def quakeml(text: str, source: str) -> Table:
             deviation = pick.time_errors.uncertainty if pick.time_errors else None
             sigma = float(deviation) if deviation else None
             rows.append({"event": number, "station": station, "phase": phase, "time": str(pick.time), "sigma_s": sigma})
-    notes = [f"picks that are rejected, or without phase or station, are left out: {unknown}"] if unknown else []
+    notes = (
+        [f"picks that are rejected, or without phase or station, are left out: {unknown}; complete them to use them"]
+        if unknown
+        else []
+    )
     return _table(rows, source, notes)
 
 

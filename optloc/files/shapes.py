@@ -368,7 +368,7 @@ def _without_reference(found: Readings, table: Table) -> Readings:
     if not same.any():
         return found
     names = ", ".join(dict.fromkeys(np.asarray(found.a)[same].tolist()))
-    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}"
+    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}; see --reference"
     return replace(found.take(np.flatnonzero(~same)), notes=(*found.notes, note))
 
 
@@ -391,7 +391,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     step = float(np.spacing(np.abs(found.values.floats()).max())) * factor
     if not floats or step < _ROUNDED:
         return found
-    note = f"arrivals are floating-point numbers, rounded to {step:.3g} m at this size; text or integers are more exact"
+    note = f"arrivals are floating-point numbers, rounded to {step:.3g} m here; write text or integers for more digits"
     return replace(found, notes=(*found.notes, note))
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 LONGEST = 200
 """Largest number of characters of a sentence."""
 
-# Frames of tables, and lines on machine code, which the inputs do not cause.
+# Frames of tables, and lines on progress, which begin with a time.
 _FRAMES = "┌├└┏┡╇┃┗╞╘"
-_MACHINE = re.compile(r"^ *\d+ ms +(?:loading|making) machine code")
+_PROGRESS = re.compile(r"^ *\d+ ms +\S")
 # Titles and lines of results, which report numbers.
 _RESULTS = re.compile(
     r"^(?:\S+ is understood as|The position is .*|[\w ]+: \d+ (?:fixes|scans) *|Alternatives|Stations, m|Suspects"
@@ -23,9 +23,9 @@ _RESULTS = re.compile(
 # Forms of a next step: an option, a command, a key or call to write, a file, and an order at the start of a clause.
 _NAMED = re.compile(r"--\w|\boptloc \w+|`[^`]+`|\b\w+ ?= ?[\"'\w\[{]|\[\[\w+\]\]|did you mean|known are")
 _VERBS = (
-    "add allow ask average change check choose compare convert copy correct count distinguish draw empty fill find fix "
-    "give increase install keep leave make measure merge model name open put remove rename repeat replace rerun run see "
-    "set state subtract swap take test treat try turn use wait write"
+    "add allow average change check choose compare complete convert copy correct distinguish draw empty fill find fix "
+    "give increase install keep leave make measure merge model name put remove rename repeat replace run see set state "
+    "subtract swap take test treat try turn use write"
 ).split()
 _ORDER = re.compile(rf"(?:^|[;:,(.] |\bor |\band |\bthen |\buntil then, )(?:{'|'.join(_VERBS)})\b", re.IGNORECASE)
 
@@ -53,7 +53,7 @@ def messages(output: str) -> list[Message]:
     found, pending, advice = [], "", False
     for line in output.splitlines():
         text = line.strip()
-        if not text or line[0] in _FRAMES or _MACHINE.match(line):
+        if not text or line[0] in _FRAMES or _PROGRESS.match(line):
             continue
         if line[0] == "│":
             cells = [cell.strip() for cell in line.strip("│").split("│")]
