@@ -295,7 +295,8 @@ def _with_reference(
     # A zero is the difference of the reference to itself for differences of times or lengths alone.
     if name is None or (found.form.kind != "tdoa" and name in found.a.tolist()):
         return hints, ""
-    return replace(hints, reference=name), f"the reference is {name}: it is the only station without a difference"
+    note = f"the reference is {name}, the only station without a difference; --reference states another"
+    return replace(hints, reference=name), note
 
 
 def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array]:

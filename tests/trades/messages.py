@@ -48,10 +48,22 @@ def names_step(text: str) -> bool:
     return bool(_NAMED.search(text) or _ORDER.search(text))
 
 
+def _untitled(lines: list[str]) -> list[str]:
+    """Return the lines without titles of tables: the lines before a frame, back to a blank line or a sentence."""
+    kept: list[str] = []
+    title = False
+    for line in reversed(lines):
+        title = title and bool(line.strip()) and not line.rstrip().endswith((".", "?")) and line[0] not in " │└"
+        if not title:
+            kept.append(line)
+        title = title or line[:1] in ("┌", "┏")
+    return kept[::-1]
+
+
 def messages(output: str) -> list[Message]:
     """Return the messages of an output: errors, warnings, notes, advice, statuses, and lines of a report."""
     found, pending, advice = [], "", False
-    for line in output.splitlines():
+    for line in _untitled(output.splitlines()):
         text = line.strip()
         if not text or line[0] in _FRAMES or _PROGRESS.match(line):
             continue

@@ -101,7 +101,7 @@ def recording(monkeypatch):
 
     # the outer command only: `said` uses the original
     monkeypatch.setattr(optloc, "locate", located)
-    monkeypatch.setattr(problems.CliRunner, "invoke", lambda *given, **more: invoke(*given, **more))
+    monkeypatch.setattr(problems.CliRunner, "invoke", invoke)
     monkeypatch.setattr(problems, "CliRunner", type("Recorder", (CliRunner,), {"invoke": invoked}))
     return found
 
