@@ -178,3 +178,13 @@ def test_every_mistake_is_one_sentence(text, options, words, tmp_path):
 def test_load_table_names_an_unknown_option(tmp_path):
     with pytest.raises(InvalidProblem, match="there is no option 'sgma'; did you mean 'sigma'"):
         load_table(written(tmp_path), sgma="0.1 s")
+
+
+def test_speeds_of_p_and_s_without_picks_are_refused(tmp_path):
+    (tmp_path / "s.csv").write_text("name,x_m,y_m\nA,0,0\nB,900,0\nC,0,900\nD,900,1000\n")
+    (tmp_path / "t.csv").write_text("station,toa_ms\nA,10\nB,20\nC,25\nD,30\n")
+    hints = {"stations": tmp_path / "s.csv", "sigma": "1 ms"}
+    with pytest.raises(InvalidProblem, match="--vp: the table has no picks of P and S"):
+        interpret_table(tmp_path / "t.csv", ColumnHints(**hints, vp="5 km/s"))
+    with pytest.raises(InvalidProblem, match="--unit: 'deg' is not a unit of"):
+        interpret_table(tmp_path / "t.csv", ColumnHints(**hints, unit="deg"))
