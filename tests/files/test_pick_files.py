@@ -84,7 +84,7 @@ def test_hypo71_phase_cards(tmp_path):
     assert fix.status.label == "ok"
     assert error < 100.0
     table = read_table(tmp_path / "event.pha")
-    assert table.notes[0] == "picks with weight 4 are left out: 1"
+    assert table.notes[0] == "picks with weight 4 are left out: 1; change their weight to use them"
     assert "weights 1 to 3 are not used" in table.notes[1]
 
 
@@ -125,7 +125,7 @@ def test_picks_of_obspy_without_phase_are_left_out(tmp_path, monkeypatch):
     (tmp_path / "event.xml").write_text(quakeml())
     table = read_table(tmp_path / "event.xml")
     assert table.labels("station").tolist() == ["AQU"]
-    assert table.notes == ("picks that are rejected, or without phase or station, are left out: 1",)
+    assert table.notes == ("picks that are rejected, or without phase or station, are left out: 1; complete them to use them",)
 
 
 @pytest.mark.parametrize("make", [hypo71, nonlinloc, quakeml])
