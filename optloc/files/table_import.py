@@ -523,7 +523,9 @@ def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table
     if is_missing.all():
         raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
     count = int(is_missing.sum())
-    notes = [f"{_cells(count)} with {hints.missing}: no reading; use --missing none if they are readings"] if count else []
+    notes = (
+        [f"{_cells(count)} with {hints.missing}: no reading; use --missing none if they are readings"] if count else []
+    )
     notes += [f"{_cells(empty)} without a number: no reading; fill in a number that is missing"] if empty else []
     return replace(found.take(np.flatnonzero(~is_missing)) if count else found, notes=(*found.notes, *notes))
 

@@ -125,7 +125,9 @@ def test_picks_of_obspy_without_phase_are_left_out(tmp_path, monkeypatch):
     (tmp_path / "event.xml").write_text(quakeml())
     table = read_table(tmp_path / "event.xml")
     assert table.labels("station").tolist() == ["AQU"]
-    assert table.notes == ("picks that are rejected, or without phase or station, are left out: 1; complete them to use them",)
+    assert table.notes == (
+        "picks that are rejected, or without phase or station, are left out: 1; complete them to use them",
+    )
 
 
 @pytest.mark.parametrize("make", [hypo71, nonlinloc, quakeml])
