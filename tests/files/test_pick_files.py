@@ -85,7 +85,7 @@ def test_hypo71_phase_cards(tmp_path):
     assert error < 100.0
     table = read_table(tmp_path / "event.pha")
     assert table.notes[0] == "picks with weight 4 are left out: 1; change their weight to use them"
-    assert "weights 1 to 3 are not used" in table.notes[1]
+    assert "weights 1 to 3 of 3 picks are not used" in table.notes[1]
 
 
 def test_nonlinloc_observations_with_their_errors_and_an_s_alone(tmp_path):

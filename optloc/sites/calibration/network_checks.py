@@ -1,8 +1,8 @@
 """Physical checks of a network before the search: negative ranges, wrong units, and times of sound read as light.
 
 The unit of a network can be checked if a size is known: from stations with known positions, from distances between
-stations, or from the size of the Earth. Pairs of stations with a known distance are given to the physical checks of
-problems, `optloc.model_checks.suspicious_values`, as stations in a plane that move from epoch to epoch.
+stations, or from the size of the Earth. The checks of problems, `optloc.model_checks.suspicious_values`, test pairs of
+stations with a known distance. Each pair is an epoch of a problem in the plane.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def plausible(network: Network) -> Network:
 
 
 def require_speed(network: Network, where: str, example: str) -> None:
-    """Raise InvalidProblem if times at the speed of light contradict the size of the network, or that of the Earth.
+    """Raise InvalidProblem if times at the speed of light contradict the size of the network or of the Earth.
 
     Call it if no wave speed is stated. `where` is the place for messages, and `example` a way to state the speed.
     """
@@ -123,7 +123,7 @@ def _known_pairs(network: Network) -> tuple[Array, Array, Array, Array]:
 
 
 def _pairs_problem(network: Network) -> Problem | None:
-    """Return a problem whose epochs are pairs of stations with a known distance, one for each pulse; None for none.
+    """Return a problem with an epoch for each pulse and each pair of stations with a known distance; None without.
 
     The two stations of an epoch are on a line, at their known distance.
     """
