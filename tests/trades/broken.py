@@ -212,6 +212,18 @@ def _scaled(case: Case, name: str, factor: float, file: str = "t.csv", column: i
     return replace(case, name=name, files={**case.files, file: table(head, cells)})
 
 
+def _with_sigmas(text: str) -> str:
+    """Return a table with a column sigma_m."""
+    head, *rows = text.splitlines()
+    return "\n".join([f"{head},sigma_m", *(f"{row},0.1" for row in rows)]) + "\n"
+
+
+def _slant() -> str:
+    """Return the ranges of a tag on the floor to anchors under a ceiling of 3 m."""
+    ranges = far({name: (*at[:2], 3.0) for name, at in HALL.items()}, (7, 5, 0))
+    return table("anchor,range_m", [(name, f"{r:.3f}") for name, r in zip(HALL, ranges, strict=True)])
+
+
 def broken() -> list[Case]:
     """Return all cases with a mistake."""
     s, h, f, t, v, q, c, b, n = (make() for make in GOOD)
@@ -270,11 +282,9 @@ def broken() -> list[Case]:
         h.called("box of two numbers", "--box", "0,0"),
         h.called("two-way metres", "--two-way"),
         h.called("speed without times", "--wave-speed", "air:20C"),
-        h.changed("sigma column beside sigma", "anchor,range_m", "anchor,sigma_m,range_m").changed(
-            "sigma column beside sigma", "A,", "A,0.1,"
-        ),
+        replace(h, name="sigma column beside sigma", files={**h.files, "t.csv": _with_sigmas(h.files["t.csv"])}),
         # slant ranges in a plane
-        replace(f, name="slant ranges", files={**f.files, "t.csv": h.files["t.csv"]}),
+        replace(f, name="slant ranges", files={**f.files, "t.csv": _slant()}),
         _scaled(f, "ranges of a plane in millimetres", 1e3),
         f.changed("anchors on a line", "24,1", "24,0", file="s.csv").changed("two anchors", "C,", "A,", file="s.csv"),
         # a track
