@@ -22,7 +22,7 @@ from optloc.base.outputs import claim
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cell_text import Decimals
-from optloc.files.columns import PLACE, role_named, role_of
+from optloc.files.columns import PLACE, is_sigma, role_named, role_of, stem
 from optloc.files.crust import crust_of
 from optloc.files.csv_formats import read_table
 from optloc.files.declination import declination_of
@@ -348,6 +348,8 @@ def _plan(
     # With a column "epoch", the window was already used to make its labels.
     if hints.window is not None and "epoch" not in epochs:
         after += ("", "[epochs]", f"window = {json.dumps(hints.window)}")
+    replaced = [name for name in rest if is_sigma(stem(name))] if hints.sigma is not None else []
+    notes += [f"--sigma replaces the column {name}; remove one of them" for name in replaced]
     height, note = _height(found, stations)
     notes += [*_few(sections, hints), *([note] if note else [])]
     read = [

@@ -126,3 +126,9 @@ def test_a_header_that_contradicts_ranges_is_reported(folder):
     output = fix().output
     assert "the range values contradict the stations in their unit, and fit them as metres" in output
     assert "--unit m" in output
+
+
+def test_an_option_that_replaces_a_column_sigma_is_named(folder):
+    rows = "\n".join(f"{name},{value:.4f},0.03" for name, value in RANGES.items())
+    (folder / "r.csv").write_text(f"anchor,range_m,sigma_m\n{rows}\n")
+    assert "--sigma replaces the column sigma_m; remove one of them." in fix().output
