@@ -183,8 +183,7 @@ def semidefinite(
 ) -> tuple[float, Array]:
     """Return the least value over 0 <= w <= 1, rules @ w <= limits, and w (n,), by Clarabel's interior-point method.
 
-    The value is a lower bound for all sets of sites. `rules` (R, n) and `limits` (R,) are the linear rules; `worst`
-    minimises the maximum over places instead of their mean.
+    The value is a lower bound for all sets of sites. The arguments are as in `semidefinite_problem`.
 
     Raises
     ------
@@ -238,12 +237,8 @@ def outer_approximation(
 
     Parameters
     ----------
-    design : Design
-        Sites and places.
-    rules, limits : Array, shapes (R, n), (R,)
-        rules @ w <= limits.
-    criterion, worst
-        As in `value`.
+    design, rules, limits, criterion, worst
+        As in `semidefinite_problem`.
     start : Array, shape (n,), optional
         A set that satisfies the rules.
     close : callable of (bound, value)

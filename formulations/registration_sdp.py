@@ -279,7 +279,9 @@ class RegistrationWindows:
         return np.asarray(self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior))
 
 
-def registration_problem(windows: int, stations: int, dimension: int, order: int, biases: int) -> Any:
+def registration_problem(
+    windows: int, stations: int, dimension: int, order: int, biases: int, change: Array | None = None
+) -> Any:
     """Build the relaxation as a cvxpy problem.
 
     Parameters
@@ -290,12 +292,14 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
         Zero for a fixed target, one for a uniformly moving one.
     biases : int
         b.
+    change : Array, shape (S, b + S), optional
+        Matrix for other unknowns w of each window: ``(r_1, f) = change (delta, w)``. By default w is (r_1, f).
 
     Returns
     -------
     cvxpy.Problem
         Variables ``shared`` of size 1 + n + b, n = d (order + 1), the lift of (1, p, v, delta), and for each window k
-        ``across k`` (1 + n + b, S) and ``own k`` (S, S), the lifts of its products with (r_1, f), and of (r_1, f).
+        ``across k`` (1 + n + b, S) and ``own k`` (S, S), the lifts of its products with w, and of w.
         Parameters ``gram k`` and ``tie k``, the inverse covariance G of the rows and G E, ``bias`` (b, b), the sum of
         E'G E and the prior, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries
         weigh the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near``
@@ -325,8 +329,12 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
         own = cp.Variable((stations, stations), symmetric=True, name=f"own {k}")
         gram, tie = cp.Parameter((rows, rows), name=f"gram {k}"), cp.Parameter((rows, biases), name=f"tie {k}")
         part = slice(k * rows, (k + 1) * rows)
+        block = cp.bmat([[shared, across], [across.T, own]])
+        if change is not None:
+            across = block[:size, first:] @ change.T
+            own = change @ block[first:, first:] @ change.T
         rules += [
-            cp.bmat([[shared, across], [across.T, own]]) >> 0,
+            block >> 0,
             own[0, 0] == moment[k] @ inner + near[k] @ head,
             unit * cp.diag(own)[1:] - 2 * own[0, 1:] + level[part] @ head + ahead[part] * across[0, 0]
             == cp.multiply(turn[part], across[0, 1:]),

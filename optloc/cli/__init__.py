@@ -7,6 +7,7 @@ from optloc.base.faces import exported
 if TYPE_CHECKING:
     from optloc.cli.app import app as app, main as main
     from optloc.cli.compile import TARGET as TARGET, problem_of as problem_of
+    from optloc.cli.completion import complete as complete
     from optloc.cli.crlb import vector as vector
     from optloc.cli.extensions import (
         Extension as Extension,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
         ProblemPath as ProblemPath,
         Quiet as Quiet,
         Verbose as Verbose,
-        complete as complete,
+        choice as choice,
         example as example,
         find_problem as find_problem,
         name_in as name_in,
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
         write_text as write_text,
     )
     from optloc.cli.track import TrackOptions as TrackOptions, dynamics_of as dynamics_of, rules as rules
-    from optloc.cli.wave import WaveSpeed as WaveSpeed
+    from optloc.cli.wave import TurnAround as TurnAround, TwoWay as TwoWay, WaveSpeed as WaveSpeed, Wind as Wind
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

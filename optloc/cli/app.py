@@ -50,10 +50,10 @@ from optloc.cli.options import (
     TrueVelocity,
     Verbose,
     allowed,
+    choice,
     constraints,
     example,
     find_problem,
-    floors_of,
     name_in,
     run_process,
 )
@@ -62,7 +62,6 @@ from optloc.cli.options import (
 
 app = typer.Typer(
     cls=CommandGroup,
-    no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,  # an internal error of optloc prints the whole traceback
     help="Position fixes from time, gain, angle and Doppler measurements, with covariance and status.",
@@ -160,9 +159,7 @@ def fix(
     """
     from optloc.cli.fix import run_fix
 
-    floors = floors_of(height)
-    one = f"{floors[0]!r} m" if floors else height
-    more, passing = constraints(one, above_ground, box, constraint or ()), allowed(allow)
+    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
         file,
@@ -177,7 +174,6 @@ def fix(
         explain=explain,
         allow=passing,
         table=table_hints(file, given),
-        floors=floors,
     )
     raise typer.Exit(code)
 
@@ -362,7 +358,7 @@ def crlb(
 def check(
     file: ProblemPath,
     as_json: Json = False,
-    by: Annotated[str, typer.Option(metavar="station|pair|kind", help="Groups of the health table.")] = "station",
+    by: Annotated[str, choice("station|pair|kind", "Groups of the health table.", "--by")] = "station",
     method: Annotated[
         str | None, typer.Option("--method", "-m", help="Method of the fixes; choose a method that resists outliers.")
     ] = None,

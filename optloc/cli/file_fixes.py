@@ -25,6 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.show import columns as tables
 from optloc.show.columns import Columns, fix_detail, level_covariance, records
 from optloc.show.formats.marks import Results
+from optloc.show.origin_time import origin_columns
 
 LOG = logging.getLogger("optloc.problem.fix")
 
@@ -77,12 +78,12 @@ class FileFixes:
 
 def _solve(problem: Problem, method: str, floors: Sequence[float]) -> Fix:
     """Return the fix of a problem; with `floors`, m, the best of the fixes at these heights."""
-    from optloc.solvers.floors import at_height, solve_on_floors
+    from optloc.solvers.floors import on_floors, solve_on_floors
     from optloc.solvers.solution import solve
 
     if not floors:
         return solve(problem, method=method)
-    return solve_on_floors([at_height(problem, height) for height in floors], method)
+    return solve_on_floors(on_floors(problem, floors), method)
 
 
 def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
@@ -173,7 +174,32 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
         dimension=loaded.problem.dimension,
         constrained=bool(loaded.problem.constraints),
     )
+    found |= _origin_times(loaded, fix, first, len(found["x"]))
     return found | in_unit_of_stations(loaded, found)
+
+
+def _origin_times(loaded: Loaded, fix: Fix, first: int | None, rows: int) -> Columns:
+    """Return the columns of emission times for a table with one row for each fix; empty for other tables.
+
+    `first` is as for `fix_columns`, and `rows` is the number of rows.
+    """
+    clock, problem = loaded.emission, loaded.problem
+    fixes = 1 if first is None else len(fix)
+    if clock is None or rows != fixes or len(problem.motions) > 1 or (first is None and problem.epochs > 1):
+        return {}
+    from optloc.uncertainty.emission import emissions
+
+    metres, epoch = np.full((2, fixes, 1), np.nan), np.arange(fixes) + (first or 0)
+    if first is None:
+        metres[:] = emissions(problem, fix)
+    else:
+        for part in (part for group in epoch_groups(problem) for part in group.parts(_QUICK_CHUNK)):
+            own = np.flatnonzero((part.epochs >= first) & (part.epochs < first + fixes))
+            if len(own):
+                chosen = part.epochs[own] - first
+                metres[:, chosen] = emissions(part.problem.take(own), fix[chosen])
+    seconds, sigma = clock.seconds(metres[0, :, 0], metres[1, :, 0], epoch)
+    return origin_columns(seconds, sigma, clock.dated)
 
 
 def in_unit_of_stations(loaded: Loaded, columns: Columns) -> Columns:

@@ -91,7 +91,6 @@ def run_fix(
     explain: bool = False,
     allow: tuple[Status, ...] = (),
     table: ColumnHints | WaveOptions | None = None,
-    floors: tuple[float, ...] = (),
 ) -> int:
     """Fix a problem file or a table under more constraints, write and print the result, and return the exit code.
 
@@ -100,8 +99,7 @@ def run_fix(
     `allow` has the statuses that give exit code 0 as well as ok. `table` has the column hints of a table, or the
     options on the wave of a problem file. Four options estimate the noise and the causes of misfits. `noise` is the
     grouping of `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to it.
-    `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error. `floors`
-    are the heights on one of which the target is, m; `more` then states one of them.
+    `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
     """
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
@@ -109,7 +107,7 @@ def run_fix(
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
     read = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, results=(out, read.problem.frame), picture=plot, inputs=[file])
-    loaded = _estimate_noise(replace(read, floors=floors), noise)
+    loaded = _estimate_noise(read, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
     loaded = loaded if rescaled is None else replace(loaded, problem=rescaled.scale(loaded.problem))
     signals = late_signals(loaded.problem) if late else None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optloc.base.errors import InvalidProblem
+from optloc.cli.completion import choices
 from optloc.cli.options import Budget, Force, Height, Json, Quiet, Verbose
 from optloc.cli.wave import WAVE_OPTIONS, wave_options
 
@@ -42,6 +43,11 @@ EXAMPLES = (
 def _option(metavar: str, text: str, *flags: str) -> Any:
     """Return an option of the panel "A table" with a value; `metavar` is the name of the value in the help."""
     return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=PANEL)
+
+
+def _choice(metavar: str, text: str, flag: str) -> Any:
+    """Return an option of the panel "A table" whose value is one of the choices of the metavar."""
+    return typer.Option(flag, metavar=metavar, help=text, rich_help_panel=PANEL, autocompletion=choices(metavar))
 
 
 def _flag(text: str, flag: str) -> Any:
@@ -96,7 +102,7 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
     "frame": Annotated[
-        _TEXT, _option("cartesian|ecef", "Frame of stations with x, y, z; by default cartesian.", "--frame")
+        _TEXT, _choice("cartesian|ecef", "Frame of stations with x, y, z; by default cartesian.", "--frame")
     ],
     "missing": Annotated[
         _TEXT,
@@ -120,7 +126,7 @@ _OPTIONS: dict[str, Any] = {
     ],
     "positive": Annotated[
         _TEXT,
-        _option(
+        _choice(
             "a-farther|b-farther",
             "Sign of the differences: positive if a, or b, is farther from the target.",
             "--positive",
@@ -141,7 +147,7 @@ _OPTIONS: dict[str, Any] = {
     "navigation": Annotated[
         Path | None, _option("FILE", "RINEX navigation file for RINEX observations or an Android log.", "--navigation")
     ],
-    "system": Annotated[_TEXT, _option("G|E|J", "Satellite system: GPS (default), Galileo or QZSS.", "--system")],
+    "system": Annotated[_TEXT, _choice("G|E|J", "Satellite system: GPS (default), Galileo or QZSS.", "--system")],
     "turned": Annotated[
         bool, _flag("Satellite positions are in ECEF axes at reception, not at transmission.", "--turned")
     ],

@@ -24,6 +24,7 @@ from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax_budget
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
+from optloc.cli.completion import choices, complete, stages, statuses
 from optloc.kernels.progress import keep_quiet
 
 if TYPE_CHECKING:
@@ -147,6 +148,13 @@ class CommandGroup(TyperGroup):
             return code
         sys.exit(code if isinstance(code, int) else 0)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Return the arguments left; without arguments, print the help and end with exit code 0."""
+        if not args:
+            typer.echo(ctx.get_help(), nl=False)
+            raise typer.Exit
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> Any:
         """Run a command; bad input and system errors give exit code 2, Ctrl-C gives 130."""
         try:
@@ -268,7 +276,10 @@ Html = Annotated[
 Allow = Annotated[
     str | None,
     typer.Option(
-        "--allow", metavar="STATUS,...", help="Statuses that give exit code 0 as well as ok, such as curved,unproven."
+        "--allow",
+        metavar="STATUS,...",
+        help="Statuses that give exit code 0 as well as ok, such as curved,unproven.",
+        autocompletion=statuses,
     ),
 ]
 Force = Annotated[
@@ -281,19 +292,6 @@ Verbose = Annotated[
 ]
 
 
-def complete(what: str) -> Callable[[str], list[str]]:
-    """Return a shell completion with the names in the table `what` of `optloc list`."""
-
-    def found(incomplete: str) -> list[str]:
-        """Return all names of the table; the shell selects the names that fit."""
-        # Each Tab starts a process, so imports wait until a list is needed.
-        from optloc.cli.listing import lists
-
-        return [next(iter(row.values())) for row in lists()[what]()]
-
-    return found
-
-
 def name_in(what: str, text: str, *flags: str) -> Any:
     """Return an option, or an argument without flags, whose value is a name in the table `what` of `optloc list`.
 
@@ -304,7 +302,21 @@ def name_in(what: str, text: str, *flags: str) -> Any:
     return typer.Option(*flags, help=words, **given) if flags else typer.Argument(help=words, **given)
 
 
-Method = Annotated[str, name_in("methods", "Method of the fix", "--method", "-m")]
+def choice(metavar: str, text: str, *flags: str) -> Any:
+    """Return an option whose value is one of the choices of a metavar such as "rms|volume|axis"; `text` is the help."""
+    return typer.Option(*flags, metavar=metavar, help=text, autocompletion=choices(metavar))
+
+
+Method = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        "-m",
+        metavar="NAME",
+        help="Method of the fix, or stages such as gtrs+lsr; see [bold]optloc list methods[/bold].",
+        autocompletion=stages,
+    ),
+]
 Geodetic = Annotated[
     bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
 ]
@@ -314,7 +326,7 @@ Height = Annotated[
         "--height",
         metavar="H",
         help="Known height above the ellipsoid, or along z of a frame that is not on Earth: 500, or '1640 ft'. "
-        "[bold]optloc fix[/bold] also takes a list of floors: '0 m, 3.5 m, 7 m'.",
+        "A list has the floors on one of which the target is: '0 m, 3.5 m, 7 m'.",
     ),
 ]
 AboveGround = Annotated[bool, typer.Option("--above-ground", help="The target is above the ellipsoid.")]
@@ -338,11 +350,11 @@ Constraint = Annotated[
 ]
 NoiseFromData = Annotated[
     str | None,
-    typer.Option(
+    choice(
+        "auto|kind|station|pair",
+        "Estimate the noise of each kind, station or pair; +epoch adds an error that their rows of an epoch share. "
+        "auto: the grouping that explains the data best.",
         "--noise-from-data",
-        metavar="auto|kind|station|pair",
-        help="Estimate the noise of each kind, station or pair; +epoch adds an error that their rows of an epoch "
-        "share. auto: the grouping that explains the data best.",
     ),
 ]
 RescaleNoise = Annotated[
@@ -410,14 +422,12 @@ def constraints(
     texts : sequence of str
         Further constraints, such as ``disc x=3 km y=2 km radius=500 m``.
     """
-    from optloc.files.constraint_table import ConstraintTable, constraint_of_text  # the help needs no schema
+    # the help needs no schema
+    from optloc.files.constraint_table import ConstraintTable, constraint_of_text, height_table
 
     found = {}
-    if height is not None and "," in height:
-        advice = "state one height; a list of floors is for optloc fix"
-        raise InvalidProblem(f"{height!r} has several heights", "--height", advice)
     if height is not None:
-        found["--height"] = ConstraintTable(kind="height", exactly=height)
+        found["--height"] = height_table(height)
     if above_ground:
         found["--above-ground"] = ConstraintTable(kind="above-ground")
     if box is not None:
@@ -433,19 +443,6 @@ def constraints(
     return found
 
 
-def floors_of(height: str | None) -> tuple[float, ...]:
-    """Return the heights of a list such as "0 m, 3.5 m, 7 m", metres; empty for one height or none.
-
-    Raise InvalidProblem for a part that is not a height.
-    """
-    parts = [] if height is None else [part.strip() for part in height.split(",")]
-    if len(parts) < 2:
-        return ()
-    from optloc.files.settings import Units
-
-    return tuple(Units("length").plain(part, "m", "--height") for part in parts)
-
-
 # Station placement.
 
 Choose = Annotated[
@@ -456,9 +453,10 @@ Costs = Annotated[
 ]
 Criterion = Annotated[
     str | None,
-    typer.Option(
-        metavar="rms|volume|axis",
-        help="Criterion: mean-square error, or volume or longest axis of the error ellipsoid.",
+    choice(
+        "rms|volume|axis",
+        "Criterion: mean-square error, or volume or longest axis of the error ellipsoid.",
+        "--criterion",
     ),
 ]
 FailOne = Annotated[bool | None, typer.Option("--fail-one/--no-fail", help="Design for the worst loss of one station.")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -42,11 +42,12 @@ from optloc.show.formats.marks import Results
 from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.entry import Entry, Rules
+from optloc.tracking.floor_tracks import track_on_floors
 from optloc.tracking.named_models import motion_named
 from optloc.tracking.run import tracked
 from optloc.tracking.several_targets import alone
 from optloc.tracking.track import State
-from optloc.tracking.updates import filter_of, reweighted
+from optloc.tracking.updates import Update, filter_of, reweighted
 
 _CLEAN = {"ok", "started", "starting"}
 # Seconds between two additions to the growing table: each addition takes a millisecond, the time of ten scans.
@@ -134,7 +135,7 @@ def run_track(
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
             for one in ones:
                 start = _start(one.problem, dynamics, wanted)
-                for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
+                for entry in _entries(one.problem, loaded.floors, dynamics, update, start, wanted.rules):
                     one.entries.append(entry)
                     _append_new_rows(growing, ones, _MIN_GAP)
                     advance(1)
@@ -151,6 +152,24 @@ def run_track(
     if not quiet and not as_json:
         _show(loaded, columns, Screen())
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+
+
+def _entries(
+    problem: Problem,
+    floors: Sequence[float],
+    dynamics: Dynamics,
+    update: Update,
+    start: State | None,
+    settings: Rules,
+) -> Iterable[Entry]:
+    """Return the results of the scans of a run; with `floors`, m, of the track on the floor that fits best."""
+    if not floors:
+        return tracked(problem, dynamics, update, start=start, rules=settings)
+    found = track_on_floors(problem, floors, dynamics, update, start=start, rules=settings)
+    LOG.info(
+        "the track is at the height %g m; the next best of the stated heights costs %g more", found.height, found.margin
+    )
+    return found.entries
 
 
 def _append_new_rows(table: GrowingTable | None, ones: list[TargetTrack], min_gap: float = 0.0) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     )
     from optloc.files.constraint_files import StatedConstraint as StatedConstraint
     from optloc.files.constraint_reader import limits_of as limits_of
-    from optloc.files.constraint_table import ConstraintTable as ConstraintTable
+    from optloc.files.constraint_table import ConstraintTable as ConstraintTable, height_table as height_table
     from optloc.files.convert import load_table as load_table
     from optloc.files.long_table import from_table as from_table
     from optloc.files.measurements import (
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         ends_of as ends_of,
         sigma_of as sigma_of,
         values_of as values_of,
+        without_turn_around as without_turn_around,
     )
     from optloc.files.one_call import locate as locate
     from optloc.files.orbits import satellites as satellites

@@ -31,11 +31,15 @@ class Argument(NamedTuple):
 ARGUMENTS = {
     "toa": Argument("toa", "s", "times of arrival"),
     "tdoa": Argument("tdoa", "s", "time differences"),
+    "p": Argument("toa", "s", "P picks"),
+    "s": Argument("toa", "s", "S picks"),
     "ranges": Argument("range", "m", "ranges"),
     "pseudoranges": Argument("toa", "m", "pseudoranges"),
     "bearings": Argument("azimuth", "deg", "bearings"),
     "elevations": Argument("elevation", "deg", "elevations"),
 }
+# Arguments whose values may be dates.
+_DATED = ("toa", "p", "s")
 # Station pairs of the last 256 sets of values.
 _ENDS = Cache[list[tuple[int, int]]](256)
 
@@ -174,7 +178,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
     stems = {stem(str(name)): name for name in reversed(list(frame.columns))}
     kind = ARGUMENTS[word].kind
     value_words = [*WORDS["z"].split(), *(stem(each) for each in (word, word.rstrip("s"), kind, *MODELS[kind].aliases))]
-    value_words += ["time", "timestamp"] if word == "toa" else []
+    value_words += ["time", "timestamp"] if word in _DATED else []
     chosen = {
         role: next((stems[each] for each in words if each in stems), None)
         for role, words in (("a", WORDS["a"].split()), ("b", WORDS["b"].split()), ("z", value_words))
@@ -191,7 +195,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
                 advice = "the rows are the stations: give the transposed frame, .T"
             raise InvalidProblem(f"no column is a {text}; there are {listed}", word, advice)
     # The words of tables; a column of times has the values of `toa`, and labels the rows of other arguments.
-    epoch_words = ("epoch", *roles()["message"].names, *(() if word == "toa" else ("time", "timestamp")))
+    epoch_words = ("epoch", *roles()["message"].names, *(() if word in _DATED else ("time", "timestamp")))
     epochs = next((stems[each] for each in epoch_words if each in stems), None)
     ends = [str(name) for name in frame[chosen["a"]]]
     if word == "tdoa" and chosen["b"] is not None:
@@ -243,6 +247,6 @@ def _numbers(word: str, values: Any) -> Array:
             array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711  (elementwise)
     except (TypeError, ValueError):
         array = np.zeros(0, dtype=bool)
-    if array.dtype.kind not in "iufM" or (array.dtype.kind == "M" and word != "toa"):
+    if array.dtype.kind not in "iufM" or (array.dtype.kind == "M" and word not in _DATED):
         raise InvalidProblem("these are not numbers", word, "give numbers, NaN for missing values")
     return array

@@ -14,9 +14,10 @@ from typing import Any, cast
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest, no_station
-from optloc.base.types import Array, Constraint, Fence, Motion
+from optloc.base.types import Amount, Array, Constraint, Fence, Motion
 from optloc.base.units import UNITS, Quantity
 from optloc.files.constraint_values import ConstraintValues
+from optloc.files.settings import Units
 from optloc.linear import constraints
 from optloc.models.surfaces import SURFACES
 from optloc.problem.constraint_checks import check_polygon
@@ -263,7 +264,16 @@ def _bound(v: ConstraintValues, key: str) -> Array:
 
 
 def _height(v: ConstraintValues) -> Made:
-    """Return a height, or a band of heights, above the ellipsoid, and the motion that can keep it."""
+    """Return a height, or a band of heights, above the ellipsoid, and the motion that can keep it.
+
+    A list of heights gives the band from the lowest to the highest; commands that fix then compare the heights.
+    """
+    if v.has("one_of"):
+        others = [key for key in ("exactly", "within", "min", "max") if v.has(key)]
+        if others:
+            raise InvalidProblem(f"a list of heights has no {others[0]!r}", v.where, "give one_of alone")
+        found = heights_of(v.given["one_of"], v.given.get("unit"), v.place("one_of"))
+        return _level(v, min(found), max(found))
     if not v.has("exactly"):
         if v.has("within"):
             raise InvalidProblem("'within' needs 'exactly'", v.where, "give exactly, or min and max alone")
@@ -277,6 +287,18 @@ def _height(v: ConstraintValues) -> Made:
         return _reported(v, within)
     level = v.amount("exactly")
     return _level(v, level - within, level + within)
+
+
+def heights_of(given: Sequence[Amount], unit: str | None, where: str) -> tuple[float, ...]:
+    """Return the heights of a list, metres, ascending and each once; `unit` is the unit of plain numbers.
+
+    Raise InvalidProblem for a list of one height; `where` is its place for messages.
+    """
+    units = Units("length")
+    found = sorted({units.plain(each, units.name(unit), where) for each in given})
+    if len(found) < 2:
+        raise InvalidProblem("a list of heights needs two different heights", where, 'or write exactly = "3.5 m"')
+    return tuple(found)
 
 
 def _level(v: ConstraintValues, low: float, high: float) -> Made:
@@ -406,8 +428,9 @@ def _quantity(v: ConstraintValues) -> Made:
 
 # Choices of several kinds: a centre, bounds, and the corners of a polygon; and how messages name them.
 _CENTRE, _BOUNDS, _LEVELS = "x y / lat_deg lon_deg", "min / max", "exactly / min / max"
+_HEIGHTS = "exactly / one_of / min / max"
 _CORNERS = "corners / corners_deg / file"
-_NOUNS = {_CENTRE: "centre", _BOUNDS: "bound", _LEVELS: "bound", _CORNERS: "corners"}
+_NOUNS = {_CENTRE: "centre", _BOUNDS: "bound", _LEVELS: "bound", _HEIGHTS: "bound", _CORNERS: "corners"}
 
 CONSTRAINT_KINDS: dict[str, ConstraintKind] = {
     "half-plane": ConstraintKind(
@@ -491,7 +514,7 @@ CONSTRAINT_KINDS: dict[str, ConstraintKind] = {
     ),
     "height": ConstraintKind(
         _height,
-        (_LEVELS,),
+        (_HEIGHTS,),
         "at a height above the WGS 84 ellipsoid",
         ("within", "unit", "along"),
         "height exactly=1640 ft",

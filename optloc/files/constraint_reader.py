@@ -14,7 +14,7 @@ from optloc.base.frames import Frame
 from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Motion, Polygon, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.constraint_files import StatedConstraint, stated
-from optloc.files.constraint_kinds import ConstraintKind, check_keys, kind_of, moves
+from optloc.files.constraint_kinds import ConstraintKind, check_keys, heights_of, kind_of, moves
 from optloc.files.constraint_table import ConstraintTable, constraint_table
 from optloc.files.constraint_values import ConstraintValues
 from optloc.files.schema import ProblemFile
@@ -136,6 +136,23 @@ def divided(limits: Sequence[Limit]) -> dict[str, Any]:
     """Return the arguments `constraints` and `fences` of a `Problem`."""
     fences = tuple(limit for limit in limits if isinstance(limit, Fence))
     return {"constraints": tuple(limit for limit in limits if not isinstance(limit, Fence)), "fences": fences}
+
+
+def floors_of(demands: Mapping[str, Demand], motions: Sequence[Motion]) -> tuple[float, ...]:
+    """Return the heights, metres, of the constraint that lists heights; empty without such a constraint.
+
+    `motions` are the motions of the targets. Raise InvalidProblem for two lists, or for several targets.
+    """
+    lists = {w: d.table for w, d in demands.items() if isinstance(d, StatedConstraint) and d.table.one_of is not None}
+    if not lists:
+        return ()
+    where = [*lists][-1]
+    if len(lists) > 1:
+        raise InvalidProblem("the heights are listed twice", where, "remove one list")
+    if len(motions) > 1:
+        raise InvalidProblem("a list of heights is for one target", where, "give each target one height, or a band")
+    table = lists[where]
+    return heights_of(table.one_of or (), table.unit, where)
 
 
 def _made(kind: ConstraintKind, values: ConstraintValues) -> Any:

@@ -18,6 +18,8 @@ from optloc.files.settings import Bound, FileTable
 
 # Maximum number of points of a line, and of lines of a grid, in the table itself: longer ones belong in a file.
 _MOST = 1000
+# Maximum number of heights in a list: each is a fix, and the tallest buildings have fewer floors.
+_FLOORS = 200
 Points = list[list[float]]
 
 
@@ -47,6 +49,8 @@ class ConstraintTable(FileTable):
     """Unit of plain numbers; by default metres, metres per second, or the SI unit of the quantity."""
     exactly: Amount | list[Bound] | None = None
     """Known height above the WGS 84 ellipsoid, or above a terrain; or a reported height for each epoch."""
+    one_of: list[Amount] | None = Field(default=None, min_length=2, max_length=_FLOORS)
+    """Known heights on one of which the target is, such as the floors of a building."""
     within: Amount | None = None
     """Half width of a band around `exactly`."""
     along: bool | None = None
@@ -118,6 +122,14 @@ class ConstraintTable(FileTable):
     def given(self) -> set[str]:
         """Return the given keys, without the keys that every kind has."""
         return {key for key in self.model_fields_set if getattr(self, key) is not None} - set(COMMON)
+
+
+def height_table(height: str) -> ConstraintTable:
+    """Return the constraint of a height such as "1640 ft", or of a list of floors such as "0 m, 3.5 m, 7 m"."""
+    parts = [part.strip() for part in height.split(",")]
+    if len(parts) < 2:
+        return ConstraintTable(kind="height", exactly=height)
+    return ConstraintTable(kind="height", one_of=list(parts))
 
 
 # A constraint as text: "disc x=3 km y=2 km radius=500 m".

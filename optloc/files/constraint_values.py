@@ -136,6 +136,14 @@ class ConstraintValues:
             missing = next((key for key in keys if not self.has(key)), None)
             if missing is not None:
                 raise InvalidProblem(f"{self.kind} has no {missing!r}", self.where, f"add the key {missing!r}")
+            if self.has("height"):
+                what = "height belongs to lat_deg and lon_deg"
+                raise InvalidProblem(
+                    what, self.place("height"), f"remove the key{', or give z' if dimension > 2 else ''}"
+                )
+            if "z" not in keys and self.has("z") and self.amount("z") != 0.0:
+                what = "stations in the plane have no z"
+                raise InvalidProblem(what, self.place("z"), "remove the key, or give x, y, z of each station")
             return np.array([self.amount(key) for key in keys])
         for key in "xyz":
             if self.has(key):

@@ -189,7 +189,7 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
     if hints.turned and AT_RECEPTION != table_problem.lines:
         raise InvalidProblem("the table has no satellites", "--turned", "remove this option")
-    stated = f"exactly = {json.dumps(hints.height)}" if hints.height is not None else table_problem.height
+    stated = table_problem.height if hints.height is None else _stated_height(hints.height)
     return with_wave(replace(table_problem, height=stated), hints.wave)
 
 
@@ -368,6 +368,12 @@ def _check_unit(hints: ColumnHints, found: Sequence[Readings]) -> None:
         raise InvalidProblem(what, "--unit", nearest(hints.unit, known[0]))
 
 
+def _stated_height(given: str) -> str:
+    """Return the line of a problem file for a height of the options, or for a list of heights."""
+    parts = [part.strip() for part in given.split(",")]
+    return f"exactly = {json.dumps(given)}" if len(parts) < 2 else f"one_of = {json.dumps(parts)}"
+
+
 def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str]:
     """Return a height constraint for a target on Earth, as a line of a problem file, and a note; empty texts for none.
 
@@ -404,7 +410,7 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
         if len({one.form.quantity for one in found}) > 1:
             advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
             raise InvalidProblem("the readings have several kinds, and each needs a sigma", "--sigma", advice)
-        return [hints.sigma] * len(found)
+        return [hints.sigma if one.sigma is None else None for one in found]
     given = sigmas_by_kind(hints.sigma)
     other = next((kind for kind in given if kind not in {one.form.kind for one in found}), None)
     if other is not None:
@@ -412,7 +418,7 @@ def _sigmas(hints: ColumnHints, found: Sequence[Readings]) -> list[str | None]:
     lacking = next((one.form.kind for one in found if one.form.kind not in given and one.sigma is None), None)
     if lacking is not None:
         raise InvalidProblem(f"{lacking} has no sigma", "--sigma", f"add {lacking}=AMOUNT after a comma")
-    return [given.get(one.form.kind) for one in found]
+    return [given.get(one.form.kind) if one.sigma is None else None for one in found]
 
 
 def _with_waves(
@@ -442,7 +448,7 @@ def _with_waves(
     crust = crust_of(hints, with_s=waves is not None)
     if waves is not None:
         section = sections[0]
-        lines = (*section.lines, f"vp_vs = {crust.vp_vs!r}")
+        lines = (*section.lines, f"vp_vs = {crust.ratio}")
         sections = (replace(section, columns={**section.columns, "phase": waves}, lines=lines),)
     heights = stations.columns.get("height", stations.columns.get("z"))
     highest = 0.0 if heights is None else float(np.max(heights)) * UNITS["length"][stations.unit]
@@ -456,13 +462,17 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
     it is a column. Times of arrival are stored relative to the first arrival of each message.
     """
     columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
-    values, text = found.values, found.form.text
+    values, text, after = found.values, found.form.text, list[str]()
     if found.form.kind == "toa":
+        timed = "time" in columns
         values, text = _from_first(found, columns), "arrivals, relative to the first of each message"
+        if not timed and "time" in columns:
+            after = [f'after = "{"date" if found.dated else "time"}"']
     columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": values}
     if found.sigma is not None and sigma is None:
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
+    lines += after
     lines += ["excess = true"] if found.form.value == "excess" else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
     if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):

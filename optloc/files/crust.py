@@ -1,7 +1,7 @@
 """Speeds of P and S waves in the ground: two numbers, or a table of layers.
 
-The ratio of the two speeds is one number for all layers, as in HYPO71 (W. H. K. Lee, J. C. Lahr, USGS Open-File Report
-75-311, 1975), so that P and S waves follow the same rays.
+If the ratio of the two speeds is one number for all layers, as in HYPO71 (W. H. K. Lee, J. C. Lahr, USGS Open-File
+Report 75-311, 1975), P and S waves follow the same rays. Otherwise each wave has its own rays.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from optloc.files.roles import ColumnPlaces
 from optloc.files.settings import Units
 from optloc.files.table import Table
 from optloc.files.table_import import ColumnHints
+from optloc.models.layers import Layers
+from optloc.models.phase_layers import PhaseLayers
 
-# Relative spread of vp / vs in a table up to which its mean is used without a note: the rounding of two decimals.
+# Relative spread of vp / vs in a table up to which its mean is used in all layers: the rounding of two decimals.
 _EQUAL = 0.005
 # Usual ratio vp / vs of rock, the square root of 3, for an advice.
 _USUAL = 1.73
@@ -37,13 +39,15 @@ class Crust:
     Parameters
     ----------
     vp_vs : float, optional
-        Speed of P waves divided by the speed of S waves; None if only P waves are known.
+        Speed of P waves divided by the speed of S waves, on average over layers; None if only P waves are known.
     speed : float, optional
         Speed of P waves, m/s; None with layers.
     depths, speeds : tuple of float
         Tops of layers, metres below the sea, and their speeds of P waves, m/s.
     note : str
         Description for the user.
+    s_speeds : tuple of float
+        Speeds of S waves of the layers, m/s, if their ratio differs between layers; else empty.
     """
 
     vp_vs: float | None
@@ -51,6 +55,12 @@ class Crust:
     depths: tuple[float, ...] = ()
     speeds: tuple[float, ...] = ()
     note: str = ""
+    s_speeds: tuple[float, ...] = ()
+
+    @property
+    def ratio(self) -> str:
+        """Return the value of the key `vp_vs` of a problem file."""
+        return '"layers"' if self.s_speeds else repr(self.vp_vs)
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -74,12 +84,20 @@ class Crust:
         """
         if self.speed is not None:
             return ()
-        surface = _STEP * ceil(max(highest, -self.depths[0]) / _STEP + 0.5)
-        depths = [0.0, *(depth + surface for depth in self.depths[1:])]
+        layers = self.layers(highest)
+        slow = (f"s_speeds = {[*self.s_speeds]!r}",) if self.s_speeds else ()
         return (
-            "", "[medium]", 'kind = "layers"', f"depths = {depths!r}", f"speeds = {[*self.speeds]!r}",
-            'between = "constant"', f"surface = {surface!r}",
+            "", "[medium]", 'kind = "layers"', f"depths = {[*layers.depth]!r}", f"speeds = {[*layers.speed]!r}", *slow,
+            'between = "constant"', f"surface = {layers.surface!r}",
         )  # fmt: skip
+
+    def layers(self, highest: float) -> Layers:
+        """Return the layers as a medium; the first extends upwards to all stations, the highest at `highest` metres."""
+        surface = _STEP * ceil(max(highest, -self.depths[0]) / _STEP + 0.5)
+        depths = (0.0, *(depth + surface for depth in self.depths[1:]))
+        if self.s_speeds:
+            return PhaseLayers(depths, self.speeds, "constant", surface, None, self.s_speeds)
+        return Layers(depths, self.speeds, "constant", surface)
 
 
 def crust_of(hints: ColumnHints, *, with_s: bool) -> Crust:
@@ -142,8 +160,10 @@ def _of_table(path: Path, hints: ColumnHints, with_s: bool) -> Crust:
             _check(one, other, path.name)
         ratio = float((vp / vs).mean())
         low, high = float((vp / vs).min()), float((vp / vs).max())
-        spread = high / low - 1.0 > _EQUAL
-        more = f"; vp / vs is {low:.4g} to {high:.4g}, and its mean is used in all layers" if spread else ""
+        if high / low - 1.0 > _EQUAL:
+            note += f"; vp / vs is {low:.4g} to {high:.4g}, so P and S waves have separate rays"
+            return Crust(ratio, None, tuple(depth.tolist()), tuple(vp.tolist()), note, tuple(vs.tolist()))
+        more = ""
     return Crust(ratio, None, tuple(depth.tolist()), tuple(vp.tolist()), f"{note}; vp / vs = {ratio:.4g}{more}")
 
 

@@ -79,11 +79,13 @@ class RowChunk:
     declination : array, optional
         Declination at that date at the stations of the present rows, radians; included in the corrections.
     vp_vs : float, optional
-        For arrivals with a phase: the speed of P waves divided by the speed of S waves.
+        For arrivals with a phase: the speed of P waves divided by the speed of S waves, or "layers".
     combination : Combination, optional
         For combinations of such arrivals: the source of their noise.
     sigma_replaced : bool
         Whether a column of the table replaces the stated sigma of the section.
+    after : "time" or "date", optional
+        For arrivals: z is seconds after the column time, or after the date that it contains.
     """
 
     kind: str
@@ -110,9 +112,10 @@ class RowChunk:
     table: Table
     declined_on: date | None = None
     declination: Array | None = None
-    vp_vs: float | None = None
+    vp_vs: float | str | None = None
     combination: Combination | None = None
     sigma_replaced: bool = False
+    after: str | None = None
 
     @property
     def depends_on_speed(self) -> bool:
@@ -178,7 +181,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
     name = _unit(section, kind, c.where)
     unit = units.conversion(name, join(c.where, "key 'unit'"))
     if there_and_back:
-        unit = _without_turn_around(c, unit, units.name(name))
+        unit = without_turn_around(c, unit, units.name(name))
     weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
     z = values_of(c, unit, weight)
@@ -201,6 +204,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.labels("target") if table.has("target") else None,
         section.excess and _is_range_sum(model), table, day, vp_vs=section.vp_vs,
         sigma_replaced=table.has("sigma") and section.sigma is not None,
+        after=section.after if kind == "toa" else None,
     )  # fmt: skip
 
 
@@ -220,6 +224,9 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
         )
     if section.positive == "b-farther" and not _is_difference(model):
         raise InvalidProblem(f"{kind} has no sign", join(c.where, "key 'positive'"), "remove the key")
+    if section.after is not None and (kind != "toa" or not c.table.has("time")):
+        advice = 'use the kind "toa" with a column time, or remove the key'
+        raise InvalidProblem("after is for arrivals with a time", join(c.where, "key 'after'"), advice)
     if kind != "range" and (section.two_way or section.turn_around is not None):
         place = join(c.where, "key 'two_way'" if section.two_way else "key 'turn_around'")
         raise InvalidProblem(f"{kind} has no way back", place, "remove it; it is for range")
@@ -230,7 +237,7 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
             raise InvalidProblem(f"{kind} is not an azimuth", join(c.where, f"key {key!r}"), "remove the key")
 
 
-def _without_turn_around(c: Context, unit: Conversion, name: str) -> Conversion:
+def without_turn_around(c: Context, unit: Conversion, name: str) -> Conversion:
     """Return the conversion of two-way times to ranges: half of the time without the turn-around, times the speed.
 
     `unit` is the conversion of half of a time, and `name` the name of the unit. Raise InvalidProblem for a length, or

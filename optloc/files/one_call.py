@@ -7,35 +7,35 @@ does not cover.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import date
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast, get_args, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optloc.base.cache import Cache
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.frames import Frame
+from optloc.base.errors import InvalidProblem
 from optloc.base.moved import renamed
-from optloc.base.types import Amount, Array, Band, Motion, Stations, Status
-from optloc.base.units import AzimuthConvention, Conversion, Quantity, conversion, in_si
-from optloc.files.by_station import ARGUMENTS, StationValues, station_values
+from optloc.base.types import Amount, Band, Motion, Status
+from optloc.base.units import Conversion, Quantity, in_si
+from optloc.files.by_station import ARGUMENTS, station_values
+from optloc.files.call_rows import North, Receivers, check_north, from_north, per_word, rows_of, scale_of
 from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
-from optloc.files.declination import declination_of, declinations
 from optloc.files.physics import warn_of_values
+from optloc.files.pick_argument import PICKS, pick_rows, wave_of_picks
 from optloc.files.propagation import is_time
 from optloc.files.roles import with_standard_columns
 from optloc.files.schema import FrameTable, StationsTable
 from optloc.files.settings import Units
 from optloc.files.stations import station_table, survey
 from optloc.files.table_import import CARTESIAN, COMPASS
-from optloc.files.wave_argument import Wave, check_times, wave_of, with_speed
+from optloc.files.wave_argument import Wave, medium_at, wave_of, with_speed, with_way, without_turn_around
 from optloc.linear import constraints
 from optloc.model_checks.plausibility import refuse_impossible
 from optloc.models import MODELS
-from optloc.models.medium import Medium
-from optloc.problem.build import Measured, assemble, measured, station_array
+from optloc.models.medium import Layers, Medium
+from optloc.problem.build import Measured, assemble, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.floors import solve_on_floors
@@ -54,39 +54,11 @@ Values: TypeAlias = (
 # Smallest distance of a point on Earth from the centre (at the poles), metres.
 _SURFACE = 6.3e6
 # Caches of receivers and of unit conversions with standard deviations: repeated calls reuse them.
-_PLACES, _SCALES = Cache["_Receivers"](64), Cache[tuple[Conversion, float]](256)
+_PLACES, _SCALES = Cache["Receivers"](64), Cache[tuple[Conversion, float]](256)
 # Quantities whose bounds determine the level of a target.
 _LEVELS = ("height", "terrain")
 # Length of a band of heights: the least and the greatest.
 _BAND = 2
-# Largest rounding of an instant as a float, as a share of its standard deviation; less has no effect.
-_STEP = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class _Receivers:
-    """Stations with their frame.
-
-    stations: stations with positions in the frame. frame: frame of the positions. level: whether the stations are on
-    Earth without altitudes. extent: greatest extent of the stations along an axis, m.
-    """
-
-    stations: Stations
-    frame: Frame
-    level: bool
-    extent: float
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the stations."""
-        return self.stations.names
-
-
-class _North(NamedTuple):
-    """Convention of bearings, such as "north-clockwise", and the declination of magnetic north; None for true north."""
-
-    azimuth: str
-    declination: Any
 
 
 @overload
@@ -109,6 +81,13 @@ def locate(
     declination: Amount | date | None = None,
     frame: str = "cartesian",
     wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
+    p: Values | None = None,
+    s: Values | None = None,
+    vp: Amount | Layers | None = None,
+    vs: Amount | None = None,
+    wind: str | Sequence[float] | None = None,
+    two_way: bool = False,
+    turn_around: Amount | None = None,
     method: str = "auto",
     speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
@@ -132,6 +111,13 @@ def locate(
     declination: Amount | date | None = None,
     frame: str = "cartesian",
     wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
+    p: Values | None = None,
+    s: Values | None = None,
+    vp: Amount | Layers | None = None,
+    vs: Amount | None = None,
+    wind: str | Sequence[float] | None = None,
+    two_way: bool = False,
+    turn_around: Amount | None = None,
     method: str = "auto",
     speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix: ...
@@ -154,6 +140,13 @@ def locate(
     declination: Amount | date | None = None,
     frame: str = "cartesian",
     wave_speed: Amount | tuple[Amount, Amount] | Medium | None = None,
+    p: Values | None = None,
+    s: Values | None = None,
+    vp: Amount | Layers | None = None,
+    vs: Amount | None = None,
+    wind: str | Sequence[float] | None = None,
+    two_way: bool = False,
+    turn_around: Amount | None = None,
     method: str = "auto",
     speed: Amount | tuple[Amount, Amount] | Medium | None = None,
 ) -> Fix:
@@ -211,6 +204,19 @@ def locate(
         (salinity, depth), or the file of a profile; a pair of a speed and its standard deviation; or a medium of
         `optloc.models`, in which rays bend or the wind carries the wave. By default light. A speed with a standard
         deviation is estimated with the position, from all measurements that are times.
+    p, s : measurements, optional
+        Arrival times of P and S waves, seconds or dates, with one unknown origin time. A station may have either or
+        both. Other measurements are then not allowed.
+    vp, vs : float, str or Layers, optional
+        Speeds of P and S waves, such as "6 km/s"; or `vp` is the file of a table of layers, or a medium of constant
+        layers, and `vs` a ratio such as "vp/1.73". A medium `PhaseLayers` has both speeds.
+    wind : str or sequence of float, optional
+        Velocity of the medium: "5 m/s from 270" (from the west), or towards the axes x and y, m/s. East and north for
+        stations on Earth.
+    two_way : bool
+        Whether `ranges` are times of the way there and back.
+    turn_around : float or str, optional
+        Time between arrival and reply at the other end, seconds or text such as "2 ms", for two-way times.
     method : str
         Method as in `optloc.solve`.
     speed : float, str, (float, float), Layers or Atmosphere
@@ -236,7 +242,7 @@ def locate(
     ('ok', [4.0, 3.0])
     """
     arguments = {"toa": toa, "tdoa": tdoa, "ranges": ranges, "pseudoranges": pseudoranges}
-    arguments |= {"bearings": bearings, "elevations": elevations}
+    arguments |= {"bearings": bearings, "elevations": elevations, "p": p, "s": s}
     given = {word: values for word, values in arguments.items() if values is not None}
     if not given:
         raise InvalidProblem("there are no measurements", "locate", f"give one of {', '.join(arguments)}")
@@ -244,9 +250,10 @@ def locate(
     for name, text in texts:
         if text is not None and not isinstance(text, str):
             raise InvalidProblem(f"{type(text).__name__} is not text", name, "give text, such as 'ns' for a unit")
-    north = _North(azimuth, declination)
-    _check_north(north, given)
-    wave = wave_of(renamed("speed", speed, "wave_speed", wave_speed))
+    north = North(azimuth, declination)
+    check_north(north, given)
+    wave = with_way(wave_of(renamed("speed", speed, "wave_speed", wave_speed)), wind, two_way, turn_around, given)
+    wave = wave_of_picks(vp, vs, wave, given)
     floors = _floors(height)
     made = [
         _problem_of(stations, latlon, given, sigma, unit, reference, level, constraints, frame, wave, north)
@@ -271,18 +278,6 @@ def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
     return replace(fix, labels=as_objects)
 
 
-def _check_north(north: _North, given: Mapping[str, Any]) -> None:
-    """Raise InvalidProblem for an unknown convention of azimuths, and for a declination without bearings.
-
-    `given` has the measurements by argument.
-    """
-    known = get_args(AzimuthConvention)
-    if north.azimuth not in known:
-        raise InvalidProblem(f"there is no convention {north.azimuth!r}", "azimuth", nearest(north.azimuth, known))
-    if north.declination is not None and "bearings" not in given:
-        raise InvalidProblem("there are no bearings", "declination", "remove this argument")
-
-
 def _texts(unit: Any) -> list[tuple[str, Any]]:
     """Return pairs of name and value that must be text, for a unit or a mapping of units."""
     return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
@@ -299,48 +294,47 @@ def _problem_of(
     limits: StatedConstraints,
     frame: str,
     wave: Wave,
-    north: _North,
+    north: North,
 ) -> tuple[Problem, list[Any] | None]:
     """Return the problem of the arguments of `locate`, and the labels of its rows; None without labels.
 
     `given` has the measurements by the name of their argument. `wave` is the wave that converts times to lengths.
     `north` is the zero direction of bearings. The other parameters are arguments of `locate`.
     """
-    speed = wave.speed
     places = _PLACES.call(_receivers, stations, latlon, frame)
-    rows, timed, labels = [], [], None
+    rows, timed, joint = list[Measured](), list[bool](), None
+    labels: list[Any] | None = None
+    if any(word in PICKS for word in given):
+        picks = pick_rows(given, sigma, unit, places, wave)
+        rows, joint, labels = [*picks.rows], picks.covariance, picks.labels
     for word, values in given.items():
+        if word in PICKS:
+            continue
+        speed = wave.range_speed if word == "ranges" else wave.speed
         found = station_values(word, values, places.names, reference)
         labels = found.labels if labels is None else labels
-        value_unit = _per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
+        value_unit = per_word(unit, word, given, "unit") or found.unit or ARGUMENTS[word].unit
         convention = north.azimuth if word == "bearings" else CARTESIAN
-        step, sigma_si = _SCALES.call(_scale, word, value_unit, sigma, list(given), speed, convention)
+        step, sigma_si = _SCALES.call(scale_of, word, value_unit, sigma, list(given), speed, convention)
         timed.append(is_time(Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed), value_unit, "unit"))
-        made = _rows(word, found, sigma_si, step, places, wave, timed=timed[-1])
-        rows.append(_from_north(made, north, value_unit, places) if word == "bearings" else made)
-    stated, motions = _constraints(height, limits, places, given, speed)
-    medium = wave.medium
-    problem = assemble(places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, medium=medium)
+        if word == "ranges" and wave.two_way:
+            step = without_turn_around(step, wave, value_unit)
+        made = rows_of(word, found, sigma_si, step, places, wave, timed=timed[-1])
+        rows.append(from_north(made, north, value_unit, places) if word == "bearings" else made)
+    if wave.wind is not None and not any(timed):
+        raise InvalidProblem("no measurement is a time, so the wind has no effect", "wind", "remove this argument")
+    stated, motions = _constraints(height, limits, places, given, wave.speed)
+    problem = assemble(
+        places.stations, *rows, frame=places.frame, constraints=stated, motions=motions, covariance=joint,
+        medium=medium_at(wave, places.frame, places.stations),
+    )  # fmt: skip
     return with_speed(problem, wave, timed), labels
-
-
-def _scale(
-    word: str, unit: str, sigma: Any, words: Sequence[str], speed: float, convention: AzimuthConvention
-) -> tuple[Conversion, float]:
-    """Return the conversion of values to SI units, and their standard deviation in SI units.
-
-    `word` is an argument of `locate`, such as "tdoa", and `unit` the unit of its values. `sigma` is the argument of
-    `locate`, and `words` are the arguments with measurements. `convention` is the zero direction of angles.
-    """
-    units = Units(cast("Quantity", MODELS[ARGUMENTS[word].kind].quantity), speed)
-    step = replace(units, convention=convention).conversion(unit, f"unit of {word}")
-    return step, _sigma_si(_per_word(sigma, word, words, "sigma"), word, units, unit)
 
 
 # Receivers.
 
 
-def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
+def _receivers(stations: Any, latlon: Any, frame: str) -> Receivers:
     """Return the stations of `locate` with their frame; raise InvalidProblem for invalid stations.
 
     Stations in degrees get a frame of east, north and up; otherwise `frame` is "cartesian" or "ecef".
@@ -365,11 +359,11 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     axes_of = None if found.axes is None else found.axes[order]
     made = station_array(found.position[order], found.names, axes=axes_of)
     extent = float(np.ptp(made.position, axis=-2).max())
-    return _Receivers(made, frame_of_stations, geodetic and not table.has("height"), extent)
+    return Receivers(made, frame_of_stations, geodetic and not table.has("height"), extent)
 
 
 def _constraints(
-    height: Any, limits: StatedConstraints, places: _Receivers, given: Mapping[str, Any], speed: float
+    height: Any, limits: StatedConstraints, places: Receivers, given: Mapping[str, Any], speed: float
 ) -> tuple[tuple[Limit, ...], tuple[Motion, ...]]:
     """Return the constraints of the target, and its motion.
 
@@ -403,7 +397,7 @@ def _floors(height: Any) -> list[Any]:
     return sorted(height, key=str) if any(isinstance(each, str) for each in height) else sorted(height)
 
 
-def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
+def _heights(height: Any, places: Receivers, given: Mapping[str, Any]) -> tuple[Band, ...]:
     """Return the constraint on the height of the target; an empty tuple for a free height.
 
     `height` is the argument of `locate`: a height, or the least and the greatest height, m. Stations on Earth without
@@ -437,117 +431,3 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
         advice = 'write frame="ecef" if they are Earth-centred'
         raise InvalidProblem("the stations are thousands of kilometres from the origin", "height", advice)
     return constraints.box([-np.inf, -np.inf, low], [np.inf, np.inf, high])
-
-
-# Measurements.
-
-
-def _per_word(given: Any, word: str, words: Collection[str], name: str) -> Any:
-    """Return the value of an argument for one kind of measurements; None if a mapping does not have the kind.
-
-    `given` is the value or a mapping by kind. `word` is the kind, `words` are the kinds with measurements, and `name`
-    is the name of the argument.
-    """
-    if isinstance(given, Mapping):
-        unknown = [key for key in given if key not in words]
-        if unknown:
-            advice = f"use {', '.join(words)}"
-            raise InvalidProblem(f"there are no measurements with the name {unknown[0]!r}", name, advice)
-        return given.get(word)
-    if name == "sigma" and given is not None and not isinstance(given, str) and len(words) > 1:
-        example = ", ".join(f'"{each}": ...' for each in words)
-        raise InvalidProblem("one number cannot be the sigma of several kinds", name, f"give {{{example}}}")
-    return given
-
-
-def _sigma_si(sigma: Any, word: str, units: Units, unit: str) -> float:
-    """Return the standard deviation of one value, SI; raise InvalidProblem if it is missing or not positive.
-
-    `sigma` is in `unit`, or text with a unit. `word` is the kind of measurements.
-    """
-    noun, default = ARGUMENTS[word].noun, units.conversion(unit, f"unit of {word}")
-    if sigma is None:
-        advice = f"give their standard deviation in {unit}, such as sigma=..., or as text with a unit"
-        raise InvalidProblem(f"the accuracy of the {noun} is unknown", "sigma", advice)
-    if not isinstance(sigma, str | float | int | np.number) or isinstance(sigma, bool):
-        raise InvalidProblem(
-            f"{type(sigma).__name__} is not a standard deviation", "sigma", "give a number, or optloc.measured"
-        )
-    number, stated_unit = units.amount(sigma if isinstance(sigma, str) else float(sigma), default, "sigma")
-    value = float(stated_unit.sigma_to_si(number))
-    if not value > 0.0:
-        raise InvalidProblem(
-            f"the standard deviation {sigma} of the {noun} is not positive", "sigma", "give a positive number"
-        )
-    return value
-
-
-def _rows(
-    word: str, found: StationValues, sigma: float, unit: Conversion, places: _Receivers, wave: Wave, *, timed: bool
-) -> Measured:
-    """Return measurements in SI units as rows; missing values have the weight 0.
-
-    `word` is the kind, `sigma` the standard deviation in SI units, `unit` the unit of the values, and `wave` the wave
-    of the call. `timed` is whether the values are times. Raise InvalidProblem for infinite values, or for times in a
-    wrong unit.
-    """
-    kind = ARGUMENTS[word].kind
-    a, b = np.array(found.keys, dtype=np.int64).T  # b is -1 except for time differences
-    values = found.values
-    if word == "toa":
-        # Dates always become seconds, independent of the unit of sigma.
-        unit = conversion("s", "length", propagation_speed=wave.speed) if values.dtype.kind == "M" else unit
-        values = _since_first(values, sigma, unit)
-    z = np.asarray(unit.to_si(values), dtype=float)
-    present = np.isfinite(z)
-    if np.isinf(z).any():
-        raise InvalidProblem("a value is infinite", word, "use NaN for missing values")
-    if timed or word in ("toa", "tdoa"):
-        check_times(word, z, sigma, places.extent, wave)
-    columns = {"weight": present.astype(float), "a": a, "b": None if word != "tdoa" else b}
-    # Differences to one station share its error, and each arrival has half of the variance of a difference. If pairs
-    # form loops, this is the cautious choice: a difference that follows from others adds no information.
-    noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if word == "tdoa" else {"sigma": sigma}
-    return measured(kind, np.where(present, z, 0.0), **columns, **noise)
-
-
-def _from_north(measurements: Measured, north: _North, unit: str, places: _Receivers) -> Measured:
-    """Return rows of bearings with the declination of magnetic north and the sense of the convention.
-
-    `unit` is the unit of a declination without a unit.
-    """
-    rows, east = measurements.rows.clockwise() if north.azimuth == COMPASS else measurements.rows, north.declination
-    if east is None:
-        return replace(measurements, rows=rows)
-    if isinstance(east, bool) or not isinstance(east, str | date | float | int | np.number):
-        what = f"{type(east).__name__} is not a declination"
-        raise InvalidProblem(what, "declination", 'give a number, "4 deg", or a date such as "2026-06-01"')
-    angle, day = declination_of(east, north.azimuth, unit, "declination")
-    at = places.stations.position[0]
-    more = angle if day is None else declinations(at, places.frame, day, "declination")[rows.a]
-    return replace(measurements, rows=replace(rows, correction=rows.correction + more))
-
-
-def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
-    """Return times (..., m) relative to the first arrival, in their unit (dates in seconds), before digits are lost.
-
-    `sigma` is the standard deviation of an arrival, m. Raise InvalidProblem for floats whose rounding is too coarse for
-    it.
-    """
-    if times.dtype.kind == "M":
-        known = ~np.isnat(times)
-        counted = times.astype("datetime64[ns]").astype(np.int64)
-        first = np.where(known, counted, np.iinfo(np.int64).max).min(-1, keepdims=True)
-        return np.where(known, (counted - first) * 1e-9, np.nan)
-    if times.dtype.kind in "iu":
-        return np.asarray((times - times.min(-1, keepdims=True)).astype(float))
-    # Floats: `coarse` is the rounding of the largest time, m. A row without any time has nothing to subtract.
-    with np.errstate(invalid="ignore"):
-        coarse = np.spacing(np.fmax.reduce(np.abs(times), axis=None, initial=0.0)) * unit.factor
-        first = np.fmin.reduce(times, axis=-1, keepdims=True)
-        counted = np.asarray(times - np.where(np.isfinite(first), first, 0.0))
-    if coarse > _STEP * sigma:
-        what = f"these times are rounded to {coarse:.3g} m of path, which is too coarse for their sigma"
-        advice = "give whole nanoseconds with unit='ns', numpy.datetime64, or times relative to a recent time"
-        raise InvalidProblem(what, "toa", advice)
-    return counted

@@ -15,10 +15,15 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.files.measurements import RowChunk
+from optloc.files.schema import MediumTable
 from optloc.files.settings import join
 from optloc.files.table import Table
+from optloc.models.phase_layers import S_TOA
 from optloc.problem.noise import Block
 from optloc.problem.phases import Combination, phase_blocks, phase_rows
+
+LAYERS = "layers"
+"""Value of the key `vp_vs` if layers have speeds of both waves."""
 
 
 def wave_of(phase: str) -> str | None:
@@ -56,11 +61,37 @@ def split_phases(
     epochs: list[Array] = []
     targets: list[Array] = []
     for chunk, epoch, label in zip(chunks, index, target, strict=True):
-        parts = [(chunk, np.arange(len(epoch)))] if chunk.vp_vs is None else _combined(chunk, epoch, label, source)
+        if chunk.vp_vs is None:
+            parts = [(chunk, np.arange(len(epoch)))]
+        elif chunk.vp_vs == LAYERS:
+            parts = _separate(chunk)
+        else:
+            parts = _combined(chunk, epoch, label, source)
         made += [part for part, _ in parts]
         epochs += [epoch[rows] for _, rows in parts]
         targets += [label[rows] for _, rows in parts]
     return made, epochs, targets
+
+
+def _separate(chunk: RowChunk) -> list[tuple[RowChunk, Array]]:
+    """Return the P and the S waves of a chunk as separate chunks, and their rows; layers have a speed for each."""
+    is_s = is_s_of(chunk.table)[chunk.row]
+    parts = []
+    for kind, rows in (("toa", np.flatnonzero(~is_s)), (S_TOA, np.flatnonzero(is_s))):
+        if not len(rows):
+            continue
+        names = ("row", "z", "a", "b", "weight", "correction", "slope", "baseline", "sigma", "label", "time", "written")
+        columns = {name: getattr(chunk, name) for name in (*names, "target")}
+        taken = {name: None if column is None else column[rows] for name, column in columns.items()}
+        parts.append((replace(chunk, kind=kind, vp_vs=None, **taken), rows))
+    return parts
+
+
+def check_layers(chunks: Sequence[RowChunk], medium: MediumTable | None, source: str) -> None:
+    """Raise InvalidProblem if the speeds of S waves are stated to be in layers, and the file has no such layers."""
+    if any(chunk.vp_vs == LAYERS for chunk in chunks) and (medium is None or medium.s_speeds is None):
+        advice = "add s_speeds to [medium], or write a ratio such as 1.73"
+        raise InvalidProblem("the file has no layers with speeds of S waves", join(source, "key 'vp_vs'"), advice)
 
 
 def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list[tuple[RowChunk, Array]]:
@@ -68,7 +99,7 @@ def _combined(chunk: RowChunk, epoch: Array, target: Array, source: str) -> list
 
     `epoch` and `target` are of the rows of the chunk. `source` is the name of the file for messages.
     """
-    assert chunk.vp_vs is not None
+    assert isinstance(chunk.vp_vs, float)
     present = np.flatnonzero(chunk.weight > 0.0)
     if chunk.sigma is None or (chunk.weight[present] != 1.0).any():
         what = "P and S arrivals need standard deviations, and weights of 0 or 1"

@@ -23,8 +23,10 @@ Row = dict[str, Any]
 
 # Two digits of a year from this number are in the 20th century: digital networks began about 1970.
 _CENTURY = 70
-# HYPO71 weights: 0 is full weight, 4 means that the pick is not used.
-_UNUSED = "4"
+# HYPO71 weights: shares of the full weight, which is 0. A pick of weight 4 is not used.
+_UNUSED, _SHARES = "4", {"1": 0.75, "2": 0.5, "3": 0.25}
+SHARE = "share of full weight"
+"""Column of the share of the full weight of a pick: its variance is the stated variance divided by the share."""
 # Characters of a line that a message shows.
 _SHOWN = 40
 
@@ -44,6 +46,9 @@ QUAKEML = re.compile(rb"(?:\xef\xbb\xbf)?\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*
 def hypo71(text: str, source: str) -> Table:
     """Return the picks of a HYPO71 phase file; picks with weight 4 are left out.
 
+    HYPO71 multiplies squared residuals by the weight of the pick (USGS Open-File Report 75-311, phase card, columns 8
+    and 40): 1, 3/4, 1/2, 1/4 and 0 for the codes 0 to 4.
+
     An event ends with a blank card, or with an instruction card, which has no station.
     """
     rows: list[Row] = []
@@ -56,13 +61,17 @@ def hypo71(text: str, source: str) -> Table:
             if weight == _UNUSED:
                 unused += 1
                 continue
-            weighted += weight in ("1", "2", "3")
-            rows.append({"event": event, **row})
+            weighted += weight in _SHARES
+            rows.append({"event": event, **row, SHARE: _SHARES.get(weight, 1.0)})
     notes = [f"picks with weight 4 are left out: {unused}; change their weight to use them"] if unused else []
     if weighted:
         notes.append(
-            f"weights 1 to 3 of {weighted} picks are not used; --sigma 'p=0.05 s,s=0.1 s' states a sigma for each wave"
+            f"{weighted} picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight: "
+            "1.15, 1.41 and 2 times the sigma"
         )
+    else:
+        for each in rows:
+            del each[SHARE]
     return _table(rows, source, notes)
 
 

@@ -16,10 +16,12 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cell_text import Decimals, date_seconds, is_dated, numbers
+from optloc.files.measurements import ESTIMATE
 from optloc.files.phase_rows import wave_of
+from optloc.files.pick_files import SHARE
 from optloc.files.roles import Roles
 from optloc.files.settings import Units
-from optloc.files.table_import import ColumnHints, Readings, in_unit, sort_named, unit_for
+from optloc.files.table_import import ColumnHints, Readings, in_unit, sort_named, stated_sigma, unit_for
 from optloc.files.words import objects
 
 # Largest number of phase names in a message.
@@ -44,14 +46,27 @@ def read_picks(roles: Roles, hints: ColumnHints) -> Readings:
     values = Decimals.of([time for _, _, time, _ in picks])
     column = np.array([number for *_, number in picks])
     found = Readings(sort_named("picks"), "s", values, rows, headers, column, station[rows], notes=notes)
-    found = replace(found, phase=objects(waves))
+    dated = all(is_dated(table, header) for header in headers)
+    found = replace(found, phase=objects(waves), dated=dated)
     given = phase_sigmas(hints)
     if given is None:
-        return found
+        return _weighted(found, roles, stated_sigma(hints, "toa"))
     lacking = next((wave for wave in dict.fromkeys(waves) if wave not in given), None)
     if lacking is not None:
         raise InvalidProblem(f"{lacking} picks have no sigma", "--sigma", "write --sigma 'p=0.05 s,s=0.1 s'")
-    return replace(found, sigma=np.array([given[wave] for wave in waves]))
+    return replace(found, sigma=np.array([given[wave] for wave in waves]) / np.sqrt(_shares(roles)[rows]))
+
+
+def _shares(roles: Roles) -> Array:
+    """Return the share of the full weight of each row of a table of picks; 1 without weights."""
+    return roles.table.numbers(SHARE) if roles.table.has(SHARE) else np.ones(roles.table.count)
+
+
+def _weighted(found: Readings, roles: Roles, sigma: str | None) -> Readings:
+    """Return picks with standard deviations that follow from a stated `sigma` and from weights of picks, if any."""
+    if sigma in (None, ESTIMATE) or not roles.table.has(SHARE):
+        return found
+    return replace(found, sigma=Units("time").plain(str(sigma), "s", "--sigma") / np.sqrt(_shares(roles)[found.row]))
 
 
 def phase_sigmas(hints: ColumnHints) -> Mapping[str, float] | None:
@@ -81,9 +96,15 @@ def differences(roles: Roles, hints: ColumnHints) -> Readings:
     )
     pairs = found.take(np.array([i for i, _ in both]))
     last = np.full(len(both), len(found.headers) - 1)
+    # The stated sigma is of a difference of two picks of full weight.
+    inverse = 1.0 / _shares(roles)[found.row]
+    ratio = np.sqrt([(inverse[i] + inverse[j]) / 2.0 for i, j in both])
+    stated = stated_sigma(hints, "range")
+    weighted = roles.table.has(SHARE) and stated not in (None, ESTIMATE)
+    sigma = Units("time").plain(str(stated), "s", "--sigma") * ratio if weighted else None
     values = Decimals.of([times[j] - times[i] for i, j in both])
     return replace(
-        pairs, form=sort_named("sp"), values=values, headers=found.headers, column=last, phase=None, sigma=None,
+        pairs, form=sort_named("sp"), values=values, headers=found.headers, column=last, phase=None, sigma=sigma,
         notes=(*found.notes, *notes),
     )  # fmt: skip
 

@@ -16,14 +16,17 @@ from optloc.files.schema import MediumTable, ProblemFile, SoundTable, SpeedTable
 from optloc.files.settings import Units, join
 from optloc.files.wave_speed import StatedSpeed, stated_speed, wind_of
 from optloc.models.medium import Atmosphere, Layers, Medium, Wind
+from optloc.models.phase_layers import PhaseLayers
 from optloc.problem.bias import SPEED, scale_of
 
 NOT_STATED = f"{SPEED_OF_LIGHT:.9g} m/s, light (not stated)"
 """Text of the wave speed of a file that states none."""
+BOTH_WAYS = "a wind has almost no effect on the way there and back, and the model has one way"
+"""Text for a wind with two-way ranges: to first order, the two ways cancel."""
 
 # Keys of each kind of medium.
 _MEDIA = {
-    "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
+    "layers": ("depths", "speeds", "s_speeds", "between", "surface", "unit", "speed_unit"),
     "atmosphere": ("refractivity", "scale_height"),
 }
 
@@ -45,13 +48,24 @@ def medium_in(
     if stated is None or stated.sigma is not None:
         what = "a wind needs a wave speed" if stated is None else "a wind needs a wave speed without a sigma"
         raise InvalidProblem(what, place, 'write propagation_speed = "air:20C", or --wave-speed air:20C')
-    velocity = wind_of(file.wind, place)
+    if any(section.two_way or section.turn_around is not None for section in file.measurements):
+        raise InvalidProblem(BOTH_WAYS, place, "remove the wind")
+    return wind_in(wind_of(file.wind, place), stated.speed, frame, stations, place)
+
+
+def wind_in(
+    velocity: tuple[float, ...], speed: float, frame: Frame | None, stations: Stations | None, place: str
+) -> Wind:
+    """Return a wind with its velocity, m/s, in the axes of a frame; east and north become axes of an ECEF frame.
+
+    `speed` is the wave speed, m/s, and `place` the place for messages.
+    """
     if frame is not None and frame.kind == "ecef" and stations is not None:
         middle = stations.position.reshape(-1, stations.dimension).mean(0)
         axes = frame.enu_axes(middle)  # rows: east, north and up
         velocity = tuple((np.array([*velocity, 0.0][:3]) @ axes).tolist())
     try:
-        return Wind(velocity, stated.speed)
+        return Wind(velocity, speed)
     except InvalidProblem as error:
         raise InvalidProblem(error.what, place, error.advice) from None
 
@@ -110,7 +124,10 @@ def medium_of(table: MediumTable, reference: float | None, place: str) -> Medium
             tuple(float(to_si(v)) for v in values or ())
             for to_si, values in ((length, table.depths), (speed, table.speeds))
         )
-        return Layers(depth, speeds, table.between, surface, reference)
+        if table.s_speeds is None:
+            return Layers(depth, speeds, table.between, surface, reference)
+        slow = tuple(float(speed(v)) for v in table.s_speeds)
+        return PhaseLayers(depth, speeds, table.between, surface, reference, slow)
     except InvalidProblem as error:
         raise InvalidProblem(error.what, place, error.advice) from None
 

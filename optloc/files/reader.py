@@ -24,9 +24,11 @@ from optloc.files.constraint_reader import (
     constraints_of,
     demands_of,
     divided,
+    floors_of,
     limits_of,
 )
 from optloc.files.constraint_table import ConstraintTable
+from optloc.files.emission_clock import EmissionClock, emission_clock
 from optloc.files.excess_paths import with_station_distance
 from optloc.files.measurements import (
     ESTIMATE,
@@ -37,7 +39,7 @@ from optloc.files.measurements import (
     square,
     with_declination,
 )
-from optloc.files.phase_rows import combined_noise, split_phases, unused_picks
+from optloc.files.phase_rows import check_layers, combined_noise, split_phases, unused_picks
 from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
@@ -99,6 +101,8 @@ class Loaded:
         Sentences on values that are physically suspicious.
     speed : str
         Wave speed, as text; empty if no value depends on it.
+    emission : EmissionClock, optional
+        Clock of the arrivals, for emission times; None without arrivals that are times.
     floors : tuple of float
         Heights, metres, on one of which the target is; empty without such a list.
     """
@@ -117,6 +121,7 @@ class Loaded:
     warnings: tuple[str, ...] = ()
     speed: str = ""
     floors: tuple[float, ...] = ()
+    emission: EmissionClock | None = None
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
@@ -283,6 +288,7 @@ def assemble(
     # Convert excess paths to path sums now, since the station positions are known.
     pairs = [(with_station_distance(chunk, i, stations), i) for chunk, i in zip(chunks, index, strict=True)]
     chunks = [with_declination(chunk, i, stations, frame) for chunk, i in pairs]
+    check_layers(chunks, file.medium, source)
     chunks, index, target = split_phases(chunks, index, target, source)
     azimuths += declination_text(chunks) if azimuths else ""
     rows, numbers = _rows(chunks, index, target)
@@ -298,7 +304,12 @@ def assemble(
     problem, levels = with_noise(file, problem, source)
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
-    loaded = Loaded(problem, source, file.title or source, *named, levels, units, azimuths, speed=words)
+    floors = floors_of(demands, problem.motions)
+    clock = emission_clock(chunks, index, numbers, all_biases, len(epochs.labels))
+    loaded = Loaded(
+        problem, source, file.title or source, *named, levels, units, azimuths, speed=words, floors=floors,
+        emission=clock,
+    )  # fmt: skip
     moving = found.moving or _has_moving_target(problem)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
 

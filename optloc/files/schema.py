@@ -142,9 +142,11 @@ class MeasurementsTable(DataTable):
     """Whether ranges are times of the way there and back."""
     turn_around: Amount | None = None
     """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
-    vp_vs: float | None = Field(default=None, gt=1.0)
+    after: Literal["time", "date"] | None = None
+    """For arrivals (toa): z is seconds after the column `time`; or after a date, the seconds since 1970 (UTC) in it."""
+    vp_vs: Annotated[float, Field(gt=1.0)] | Literal["layers"] | None = None
     """For arrivals (toa) with a column `phase`, P or S: speed of P waves, the propagation speed, divided by the speed
-    of S waves. Rows of one epoch have one origin time."""
+    of S waves; or "layers" for layers with `s_speeds`. Rows of one epoch have one origin time."""
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None
@@ -280,7 +282,9 @@ class MediumTable(FileTable):
     depths: list[float] | None = Field(default=None, max_length=_LAYERS)
     """For layers: increasing depths; of points between which the speed is linear, or of the tops of layers."""
     speeds: list[float] | None = Field(default=None, max_length=_LAYERS)
-    """For layers: the speed at each depth."""
+    """For layers: the speed at each depth; with `s_speeds`, of P waves."""
+    s_speeds: list[float] | None = Field(default=None, max_length=_LAYERS)
+    """For layers: the speed of S waves at each depth."""
     between: Literal["linear", "constant"] = "linear"
     """For layers: speed between the depths, linear or constant."""
     surface: Amount = 0.0

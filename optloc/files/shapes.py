@@ -113,9 +113,11 @@ def _wide_sort(
     number = np.repeat(np.arange(len(columns)), list(map(len, values)))
     names, row = tuple(one.column for one in columns), np.concatenate(rows)
     a, b = (np.array(end, dtype=object)[number] for end in zip(*ends, strict=True))
+    all_dated = form.quantity == "length" and all(is_dated(table, one.column) for one in columns)
     found = Readings(
-        form, first, Decimals.join(values), row, names, number, a, b if pairs else None, notes=tuple(notes)
-    )
+        form, first, Decimals.join(values), row, names, number, a, b if pairs else None, notes=tuple(notes),
+        dated=all_dated,
+    )  # fmt: skip
     # Standard deviations of a part of the columns are not used.
     if len(deviations) == len(columns):
         found = replace(found, sigma=np.concatenate(deviations), errors=tuple(dict.fromkeys(errors_used)))
@@ -256,7 +258,8 @@ def read_long(
     found = _of_column(form, unit, cells, column, a)
     hints, why = _with_reference(found, roles, hints, stations)
     positive, b = ("a-farther", None) if form.stations == 1 else _second_station(roles, hints)
-    found = replace(found, b=None if b is None else b[pick], notes=tuple(text for text in (note, why) if text))
+    notes = tuple(text for text in (note, why) if text)
+    found = replace(found, b=None if b is None else b[pick], notes=notes, dated=dated)
     if (sigma_name := sigma_column(roles, form, hints, forms)) is not None:
         found = replace(found, sigma=sigma_of(table, sigma_name, form, unit, pick), errors=(sigma_name,))
     return _checked(found, roles, hints, stations, table.count - len(pick), positive)

@@ -207,6 +207,8 @@ class Readings:
         Assumptions, and readings that were left out.
     phase : object array (m,), optional
         Wave of each pick, "P" or "S".
+    dated : bool
+        Whether the values are dates, in seconds since 1970.
     """
 
     form: Form
@@ -224,6 +226,7 @@ class Readings:
     errors: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     phase: Array | None = None
+    dated: bool = False
 
     def take(self, pick: Array) -> Readings:
         """Return the readings with the indices `pick`."""

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.base.units import SPEED_OF_LIGHT, in_si
-from optloc.files.propagation import fits_sound, medium_of
-from optloc.files.wave_speed import is_profile, profile_of, stated_speed
+from optloc.base.frames import Frame
+from optloc.base.types import Array, Stations
+from optloc.base.units import SPEED_OF_LIGHT, UNITS, Conversion, in_si
+from optloc.files.crust import Crust
+from optloc.files.propagation import BOTH_WAYS, fits_sound, medium_of, wind_in
+from optloc.files.settings import Units
+from optloc.files.wave_speed import is_profile, profile_of, stated_speed, wind_of
 from optloc.models.medium import Medium
 from optloc.problem.bias import scale_of
 from optloc.problem.problem import Problem
@@ -25,12 +28,80 @@ _TOO_FAR = 100.0
 
 
 class Wave(NamedTuple):
-    """The wave of a call: its speed, m/s, the standard deviation of the speed, the medium, and whether it is stated."""
+    """The wave of a call.
+
+    speed: m/s. sigma: standard deviation of the speed. medium: its medium. stated: whether the speed is stated. wind:
+    velocity of the medium, m/s. two_way: whether ranges are times of the way there and back. turn_around: time between
+    arrival and reply, s. crust: speeds of P and S waves.
+    """
 
     speed: float
     sigma: float | None = None
     medium: Medium | None = None
     stated: bool = True
+    wind: tuple[float, ...] | None = None
+    two_way: bool = False
+    turn_around: float = 0.0
+    crust: Crust | None = None
+
+    @property
+    def range_speed(self) -> float:
+        """Return the speed that converts the times of ranges, m/s: half of the wave speed for both ways."""
+        return 0.5 * self.speed if self.two_way else self.speed
+
+
+def with_way(wave: Wave, wind: Any, two_way: bool, turn_around: Any, words: Collection[str]) -> Wave:
+    """Return a wave with a wind and with two-way ranges, which are arguments of `locate`.
+
+    `words` are the arguments with measurements. Raise InvalidProblem for values that are not understood or that have no
+    effect.
+    """
+    if wind is not None:
+        if wave.medium is not None or wave.sigma is not None or not wave.stated:
+            what = "a wind needs one wave speed without a sigma"
+            raise InvalidProblem(what, "wind", 'state it, such as wave_speed="air:20C"')
+        if not isinstance(wind, str | Sequence | np.ndarray):
+            raise InvalidProblem(f"{type(wind).__name__} is not a wind", "wind", "give '5 m/s from 270', or (5.0, 0.0)")
+        try:
+            velocity = wind_of(wind if isinstance(wind, str) else [float(v) for v in wind], "wind")
+        except (TypeError, ValueError):
+            what, advice = f"{wind!r} is not a wind", "give '5 m/s from 270', or (5.0, 0.0) towards x and y"
+            raise InvalidProblem(what, "wind", advice) from None
+        wave = wave._replace(wind=velocity)
+    if not two_way and turn_around is None:
+        return wave
+    name = "two_way" if two_way else "turn_around"
+    if "ranges" not in words:
+        raise InvalidProblem("there are no ranges", name, "give the times as ranges=, or remove this argument")
+    if wind is not None:
+        raise InvalidProblem(BOTH_WAYS, "wind", "remove the wind")
+    pause = 0.0 if turn_around is None else Units("time").plain(turn_around, "s", "turn_around")
+    if not pause >= 0.0:
+        raise InvalidProblem("the turn-around time is negative", "turn_around", 'write it as "2 ms"')
+    return wave._replace(two_way=True, turn_around=pause)
+
+
+def without_turn_around(unit: Conversion, wave: Wave, name: str) -> Conversion:
+    """Return the conversion of two-way times to ranges, without the turn-around time.
+
+    `unit` is the conversion of half of a time, and `name` the name of the unit. Raise InvalidProblem for a length.
+    """
+    if name not in UNITS["time"]:
+        advice = "give unit='ms' or another unit of time, or remove this argument"
+        raise InvalidProblem(f"two-way ranges are times, but the unit is {name}", "two_way", advice)
+    return replace(unit, offset=-wave.range_speed * wave.turn_around)
+
+
+def medium_at(wave: Wave, frame: Frame, stations: Stations) -> Medium | None:
+    """Return the medium of a wave in the frame of the stations; None for straight rays at one speed."""
+    if wave.wind is not None:
+        return wind_in(wave.wind, wave.speed, frame, stations, "wind")
+    if wave.crust is not None and wave.crust.depths:
+        base = 0.0 if frame.origin is None else frame.origin[2]
+        highest = float(stations.position[..., 2].max()) if stations.dimension > 2 else 0.0
+        layers = wave.crust.layers(base + highest)
+        return replace(layers, surface=layers.surface - base)
+    return wave.medium
 
 
 def wave_of(given: Any) -> Wave:

@@ -112,7 +112,10 @@ def fence(
         raise InvalidProblem("the offset is not a finite number", name, "give metres, or leave the fence out")
     if not (np.isfinite(spread) & (spread > 0.0)).all():
         raise InvalidProblem("sigma is not a positive number", name, "give metres; for an exact boundary use a box")
-    return (Fence(direction / length[..., None], place / length, spread / length, name, target),)
+    # all numbers get the same batch axes
+    place, spread = np.broadcast_arrays(place / length, spread / length)
+    unit = np.broadcast_to(direction / length[..., None], (*place.shape, direction.shape[-1]))
+    return (Fence(unit, place, spread, name, target),)
 
 
 def cost_of_margin(u: Any) -> Any:

@@ -138,11 +138,20 @@ class AdmittedPoints:
     part: slice
 
     def __call__(self, points: Array) -> Array:
-        """Return flags (...) of the admitted ones of points (..., d), metres from the fix."""
+        """Return flags (...) of the admitted ones of points (..., d), metres from the fix, for many points."""
+        return is_admitted(self.problem, self._moved(points)).reshape(points.shape[:-1])
+
+    def within_rounding(self, points: Array) -> Array:
+        """Return the same flags, with points on the boundary of a polygon admitted, whatever rounding says."""
+        broken = violation(self.problem, self._moved(points)) > TOLERANCE
+        return np.asarray(~broken).reshape(points.shape[:-1])
+
+    def _moved(self, points: Array) -> Array:
+        """Return the vectors (N, size) of the fix moved by points (..., d)."""
         flat = points.reshape(-1, points.shape[-1])
         moved = np.repeat(self.x[None], len(flat), axis=0)
         moved[:, self.part] += flat
-        return is_admitted(self.problem, moved).reshape(points.shape[:-1])
+        return moved
 
 
 def _regions(problem: Problem, x: Array, spread: Array, part: slice) -> Array | None:

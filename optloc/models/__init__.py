@@ -21,6 +21,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Registry
 from optloc.base.units import UNITS
 from optloc.models.medium import Atmosphere as Atmosphere, Layers as Layers, Wind as Wind, arrival, path, path_rate
+from optloc.models.phase_layers import S_TOA, PhaseLayers as PhaseLayers, shear_path
 from optloc.models.primitives import (
     Components,
     Point,
@@ -361,6 +362,16 @@ BETWEEN = "station to station"
 """Name of the kind for a distance between two stations, without a target, in networks with unknown stations."""
 
 
+_S_TOA = Model(
+    lambda t, a, b: distance(t, a),
+    "length",
+    1,
+    "time of arrival of an S wave times the speed of P waves, in layers with two speeds",
+    emission=True,
+    ray=lambda t, a, b: shear_path(t, a),
+)
+
+
 class _DerivedKinds(dict[str, Model]):
     """Table of kinds that are not listed: kinds along rays, made from their names, and distances between stations."""
 
@@ -368,6 +379,8 @@ class _DerivedKinds(dict[str, Model]):
         """Return the kind with this name; raise KeyError if the name is not a derived kind."""
         if name == BETWEEN:
             return Model(lambda t, a, b: distance(a, b), "length", 2, "distance of two stations")
+        if name == S_TOA:
+            return _S_TOA
         if not name.startswith(RAY):
             raise KeyError(name)
         return _along_rays(name)

@@ -41,8 +41,10 @@ class Wind:
     speed: float
 
     def __post_init__(self) -> None:
-        if len(self.velocity) not in (2, 3):
-            what = f"the wind has {len(self.velocity)} components"
+        # a number has no length
+        count = len(self.velocity) if hasattr(self.velocity, "__len__") else 1
+        if count not in (2, 3):
+            what = f"the wind has {count} components"
             raise InvalidProblem(what, "wind", "give its velocity towards the axes x and y, such as (3.0, -4.0)")
         strength = sum(v * v for v in self.velocity) ** 0.5
         if not strength <= _FASTEST * self.speed:

@@ -82,7 +82,7 @@ if TYPE_CHECKING:
         variances as variances,
         whiten as whiten,
     )
-    from optloc.problem.posed_answer import PosedAnswer as PosedAnswer
+    from optloc.problem.posed_answer import PosedAnswer as PosedAnswer, PosedSolution as PosedSolution
     from optloc.problem.problem import Problem as Problem
     from optloc.problem.signal import Signal as Signal
 

@@ -17,7 +17,22 @@ from optloc.base.arrays import as_deviations, as_integers, numbers
 from optloc.base.cache import Cache, key_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
-from optloc.base.types import Amount, Amounts, Array, Bias, Constraint, Fence, Motion, Prior, Rows, Stations, Whole
+from optloc.base.types import (
+    Amount,
+    Amounts,
+    AnyOf,
+    Array,
+    Band,
+    Bias,
+    Constraint,
+    Fence,
+    Motion,
+    Polygon,
+    Prior,
+    Rows,
+    Stations,
+    Whole,
+)
 from optloc.base.units import Quantity, in_si
 from optloc.models import BEARING, MODELS, kind_named
 from optloc.models.medium import Medium
@@ -303,7 +318,7 @@ def assemble(
         tuple(biases),
         tuple(priors),
         frame,
-        tuple(c for given in constraints for c in (given if isinstance(given, tuple | list) else (given,))),
+        _listed_constraints(constraints),
     )
     joint = numbers(covariance, "covariance")
     key = _key(result, measurements, joint, medium)
@@ -315,6 +330,16 @@ def assemble(
     result = replace(at_rest(result if medium is None else result.in_medium(medium)), noise=template.noise)
     vars(result).update(template.derived)
     return result
+
+
+def _listed_constraints(given: Any) -> tuple[Any, ...]:
+    """Return constraints and fences as one tuple, also of nested sequences; raise InvalidProblem for anything else."""
+    if isinstance(given, tuple | list):
+        return tuple(one for each in given for one in _listed_constraints(each))
+    if not isinstance(given, Band | Polygon | AnyOf | Fence):
+        what = f"{type(given).__name__} is no constraint"
+        raise InvalidProblem(what, "constraints", "use the functions of optloc.constraints")
+    return (given,)
 
 
 class _Template(NamedTuple):

@@ -36,6 +36,8 @@ def check_constraints(problem: Problem) -> None:
     """Raise if a constraint is invalid. Constraints that no position meets are not an error: they give a status."""
     for constraint in (*problem.constraints, *problem.fences):
         where = f"constraint {constraint.name!r}"
+        if not isinstance(constraint.name, str):
+            raise InvalidProblem("the name is no text", where, "give a text such as 'harbour'")
         _check_target(problem, constraint, where)
         if isinstance(constraint, Polygon):
             _check_plan(problem, "a polygon", where)
@@ -48,11 +50,34 @@ def check_constraints(problem: Problem) -> None:
             raise InvalidProblem("the normal has another dimension than the stations", where, "match the stations")
     for same in bands_by_quantity(problem.constraints):
         _check_agreement(same)
+    _check_equalities(problem)
+
+
+def _check_equalities(problem: Problem) -> None:
+    """Raise if the equalities on the position of a target without a motion are dependent, or more than coordinates."""
+    for target, motion in enumerate(problem.motions):
+        exact = [
+            band
+            for band in problem.constraints
+            if isinstance(band, Band) and band.target == target and np.all(band.lower == band.upper)
+        ]
+        planes = [band for band in exact if band.kind == "plane" and np.ndim(band.coefficients) == 1]
+        width = max((len(band.coefficients) for band in planes), default=0)
+        normals = [np.append(one.coefficients, np.zeros(width - len(one.coefficients))) for one in planes]
+        if len(planes) > 1 and np.linalg.matrix_rank(np.array(normals)) < len(planes):
+            where = f"constraint {planes[-1].name!r}"
+            raise InvalidProblem("the other equalities determine it already", where, "leave one of them out")
+        if motion.order == 0 and len(exact) > problem.dimension and all(band.other is None for band in exact):
+            what = f"{len(exact)} equalities are more than the {problem.dimension} coordinates of the target"
+            raise InvalidProblem(what, f"constraint {exact[-1].name!r}", "leave one of them out")
 
 
 def _check_target(problem: Problem, constraint: Constraint | Fence, where: str) -> None:
     """Raise if the target of a constraint is missing or known, or if other unknowns connect its free epochs."""
     count = len(problem.motions)
+    if not isinstance(constraint.target, int | np.integer):
+        what = f"the target {constraint.target!r} is no whole number"
+        raise InvalidProblem(what, where, f"use 0 to {count - 1}")
     if not 0 <= constraint.target < count:
         raise InvalidProblem(f"there is no target {constraint.target}", where, f"use 0 to {count - 1}")
     motion = problem.motions[constraint.target]

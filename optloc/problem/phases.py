@@ -193,7 +193,7 @@ def phases(
 
     Parameters
     ----------
-    z : array (n,)
+    z : array (..., n)
         Arrival times multiplied by the speed of P waves, metres. In layers, this speed is their `unit_speed`.
     a : int array (n,)
         Station of each arrival.
@@ -224,14 +224,14 @@ def phases(
     >>> fix.position.round(3).tolist()
     [4000.0, 3000.0]
     """
-    values = np.asarray(z, dtype=float)
+    values = np.atleast_1d(np.asarray(z, dtype=float))
     try:
         station, late, event, deviation = (
-            np.broadcast_to(np.asarray(given, dtype=kind), values.shape)
+            np.broadcast_to(np.asarray(given, dtype=kind), values.shape[-1:])
             for given, kind in ((a, np.int64), (is_s, bool), (epoch, np.int64), (sigma, float))
         )
     except ValueError:
-        what = f"there are {values.size} arrivals, but another argument has another length"
+        what = f"there are {values.shape[-1]} arrivals, but another argument has another length"
         raise InvalidProblem(what, "phases", "give one value for each arrival") from None
     sets, _ = phase_rows(station, late, event, ratio)
     rows = tuple(

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from optloc.base.types import Array
 
 
 @dataclass(frozen=True, slots=True)
-class PosedAnswer:
+class PosedSolution:
     """The solution of a posed optimisation problem.
 
     Parameters
     ----------
-    formulation : str
-        Name of the formulation.
     duals : mapping of str to float or array
         Multiplier of each named constraint, in units of the objective per SI unit of the right-hand side. It is at
         least zero for ``<=`` and for ``>=``. For ``left == right``, the gradient of the objective plus the multiplier
@@ -26,11 +24,36 @@ class PosedAnswer:
     backend : formulations.solver_report.SolverReport
         Status, residuals, relative gap, iterations and time, as the back end reports them.
     value : float
+        Objective at the solution; NaN without one.
+    bound : float
+        Lower bound of the objective of a convex problem, recomputed from a dual point; NaN without a bound.
+    """
+
+    duals: Mapping[str, float | Array]
+    values: Mapping[str, float | Array]
+    backend: Any
+    value: float
+    bound: float
+
+    def by_name(self) -> dict[str, Any]:
+        """Return these fields by name, to build a solution with more of them."""
+        return {one.name: getattr(self, one.name) for one in fields(PosedSolution)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PosedAnswer(PosedSolution):
+    """The solution of a posed problem of `optloc.pose`; duals, values and report are as in `PosedSolution`.
+
+    Parameters
+    ----------
+    value : float
         Objective at the solution: chi-square, unless you or the formulation replace it.
     bound : float
         Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound. It bounds
         the cost of maximum likelihood for "moment_sdp" (in its box) and "lifted" only. "direction_sdp" minimises chords
         instead of angles, the other formulations for instance squared ranges. Their bounds may exceed that cost.
+    formulation : str
+        Name of the formulation.
     rank_ratio : float
         Second over first eigenvalue of a lifted matrix, or distance from the relaxed surface; NaN if nothing is lifted.
         A value near zero means that the relaxation is exact.
@@ -41,11 +64,6 @@ class PosedAnswer:
     """
 
     formulation: str
-    duals: Mapping[str, float | Array]
-    values: Mapping[str, float | Array]
-    backend: Any
-    value: float
-    bound: float
     rank_ratio: float
     refined: bool
     variables: Mapping[str, Array]

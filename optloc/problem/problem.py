@@ -32,9 +32,11 @@ from optloc.base.types import (
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS, bent
 from optloc.models.medium import Atmosphere, Medium, Wind
+from optloc.models.phase_layers import S_TOA, PhaseLayers
 from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
+from optloc.problem.straight_phases import straight_s_rows
 
 
 @dataclass(frozen=True)  # without slots, because the cached properties need `__dict__`
@@ -216,8 +218,12 @@ class Problem:
         if self.medium is None:
             return self
         rows = []
+        early = [block for block in self.rows if MODELS[block.kind].straight == "toa"]
         for block in self.rows:
             model = MODELS[block.kind]
+            if model.straight == S_TOA and isinstance(self.medium, PhaseLayers):
+                rows.append(straight_s_rows(block, early, self.medium))
+                continue
             factor = self.medium.straight if model.quantity in ("length", "speed") else 1.0
             straight = replace(
                 block, kind=model.straight or block.kind, z=factor * block.z, correction=factor * block.correction

@@ -81,6 +81,7 @@ class Truncated:
     region : object array (...), optional
         For distributions whose bounds are no planes: functions that map points (..., d), metres from the fix, to flags
         (...) of the admitted ones. None for the others. With such a function, planes serve the shape of the cost only.
+        Their method ``within_rounding`` returns the flags with points on a boundary admitted.
     """
 
     normal: Annotated[Array, Axes(2, slots=True, empty=0.0)]
@@ -120,8 +121,11 @@ class Truncated:
         several = self._has_region | (finite.sum(-1) != 1)
         several = several | np.isfinite(np.where(finite[..., None], self.span, np.inf)).any((-1, -2))
         for i in zip(*np.nonzero(np.atleast_1d(several & self.cuts)), strict=True):
-            index = tuple(map(int, i)) if several.ndim else ()
-            mean[index], covariance[index] = take(self, index).moments_by_rays()
+            if several.ndim:
+                index = tuple(map(int, i))
+                mean[index], covariance[index] = take(self, index).moments_by_rays()
+            else:  # `region` is the function itself then, no array of functions
+                mean[...], covariance[...] = self.moments_by_rays()
         return mean, covariance
 
     def moments_by_rays(self) -> tuple[Array, Array]:
@@ -155,7 +159,7 @@ class Truncated:
     def admits(self, points: Array) -> Array:
         """Return a mask (...) of the points (..., d), metres from the fix of one distribution, inside the bounds."""
         if self.region is not None:
-            return np.asarray(self._inside(points))
+            return np.asarray(self._test.within_rounding(points))
         sigma = np.sqrt(np.maximum(np.einsum("hi,ij,hj->h", self.normal, self.covariance, self.normal), 0.0))
         beyond = points @ self.normal.T - np.where(np.isfinite(self.slack), self.slack, 0.0)
         outside = np.isfinite(self.slack) & (beyond > self.give + _ON * sigma)
@@ -276,11 +280,15 @@ class Truncated:
         place, tip = at[..., None] * step[:, None], length[:, None] * step
         return _Rays(lean, begin, length, rank, middle, whitener, factor @ whitener, place, tip, weight)
 
+    @property
+    def _test(self) -> Any:
+        """Return the function of one distribution that tests points."""
+        # One distribution taken out of a batch has its function in an array without axes.
+        return self.region[()] if isinstance(self.region, np.ndarray) else self.region
+
     def _inside(self, points: Array) -> Array:
         """Return flags (...) of admitted points (..., d), metres from the fix, by the function of one distribution."""
-        # One distribution taken out of a batch has its function in an array without axes.
-        function: Any = self.region[()] if isinstance(self.region, np.ndarray) else self.region
-        return np.asarray(function(points))
+        return np.asarray(self._test(points))
 
     def _parts(self, step: Array, length: Array) -> tuple[Array, Array, Array]:
         """Return the admitted parts of rays: the number of the ray of each, and its begin and end in steps.

@@ -28,8 +28,12 @@ from optloc.cli import (
     Outside,
     ProblemPath,
     Quiet,
+    TurnAround,
+    TwoWay,
     Verbose,
     WaveSpeed,
+    Wind,
+    choice,
     example,
 )
 from optloc.files import claim, visible
@@ -37,7 +41,7 @@ from optloc.problem import InvalidProblem, nearest
 
 if TYPE_CHECKING:
     from optloc.service.recording import Recorded
-    from optloc.service.site import Site
+    from optloc.service.site import Site, SiteOptions
     from optloc.service.sources import Adapter
     from optloc.service.stream import Stream
 
@@ -55,10 +59,10 @@ Speed = Annotated[
     typer.Option(metavar="N", help="Replay speed relative to the recording; by default as fast as possible."),
 ]
 Wait = Annotated[str, typer.Option(metavar="TIME", help="Time from the first row of an event to its closing.")]
-Late = Annotated[str, typer.Option(metavar="drop|revise", help="Ignore late rows, or answer again.")]
+Late = Annotated[str, choice("drop|revise", "Ignore late rows, or answer again.", "--late")]
 Phases = Annotated[
     str,
-    typer.Option(metavar="two|one|fix", help="Answers: a fix at once and its proof later, both in one, or no proof."),
+    choice("two|one|fix", "Answers: a fix at once and its proof later, both in one, or no proof.", "--phases"),
 ]
 Deadline = Annotated[
     str | None,
@@ -95,7 +99,7 @@ Zmq = Annotated[
 ]
 Adapt = Annotated[
     str | None,
-    typer.Option("--adapter", metavar="chirpstack|mode-s", help="Format of the input lines from other systems."),
+    choice("chirpstack|mode-s", "Format of the input lines from other systems.", "--adapter"),
 ]
 
 Model = Annotated[
@@ -148,6 +152,9 @@ def live(
     noise: Noise = None,
     gap: Gap = None,
     wave_speed: WaveSpeed = None,
+    wind: Wind = None,
+    two_way: TwoWay = False,
+    turn_around: TurnAround = None,
     height: Height = None,
     check: Annotated[bool, typer.Option("--check", help="Print the input format of the stream, and end.")] = False,
     outside: Outside = False,
@@ -161,14 +168,14 @@ def live(
     The rows of FILE are the template of an event. Signals: TERM answers all waiting events and ends, HUP reloads FILE.
     """
     if check:
-        raise typer.Exit(run_check(file, method, (wave_speed, height)))
+        raise typer.Exit(run_check(file, method, site_options(wave_speed, wind, two_way, turn_around, height)))
     settings = _settings(wait, late, phases, deadline, part, form) | {"state": state, "record": record}
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
     options = ServiceOptions(
         settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq),
-        stated=(wave_speed, height),
+        stated=site_options(wave_speed, wind, two_way, turn_around, height),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -202,6 +209,9 @@ def serve(
     noise: Noise = None,
     gap: Gap = None,
     wave_speed: WaveSpeed = None,
+    wind: Wind = None,
+    two_way: TwoWay = False,
+    turn_around: TurnAround = None,
     height: Height = None,
     outside: Outside = False,
     budget: Budget = None,
@@ -218,7 +228,7 @@ def serve(
     settings["every"] = seconds_of(every, "--every")
     options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
-        stated=(wave_speed, height),
+        stated=site_options(wave_speed, wind, two_way, turn_around, height),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -266,7 +276,7 @@ class ServiceOptions:
     recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
     proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
     not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
-    recording. stdout: whether answers go to standard output. stated: wave speed and height of the options, or None.
+    recording. stdout: whether answers go to standard output. stated: options on the wave and the height, or None.
     """
 
     settings: dict[str, Any]
@@ -281,7 +291,7 @@ class ServiceOptions:
     adapter: str | None = None
     stdin: bool = True
     stdout: bool = True
-    stated: tuple[str | None, str | None] = (None, None)
+    stated: SiteOptions | None = None
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
@@ -290,12 +300,13 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     `file` is the problem file of the site.
     """
     from optloc.service.recording import read_recording
+    from optloc.service.site import read_site
     from optloc.service.sources import adapter_of
     from optloc.service.stream import Settings, Stream
 
     if not options.speed > 0.0:
         raise InvalidProblem(f"the speed is {options.speed:g}, not positive", "--speed", "give a positive number")
-    site = _site(file, options.method, options.stated)
+    site = read_site(file, options.method, options.stated)
     adapter = None if options.adapter is None else adapter_of(options.adapter, site.stations)
     recording = None if options.recording is None else read_recording(options.recording)
     # lines of a file can wait, so no proof needs to be skipped
@@ -357,21 +368,24 @@ def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, reco
         _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
 
 
-def _site(file: Path, method: str, stated: tuple[str | None, str | None]) -> Site:
-    """Return the site of a file; `stated` has the wave speed and the height of the options, or None."""
+def site_options(
+    wave_speed: str | None, wind: str | None, two_way: bool, turn_around: str | None, height: str | None
+) -> SiteOptions:
+    """Return the options of a command that replace statements of the file of a site."""
     from optloc.files import WaveOptions
-    from optloc.service.site import SiteOptions, read_site
+    from optloc.service.site import SiteOptions
 
-    speed, height = stated
-    return read_site(file, method, SiteOptions(WaveOptions(speed), height))
+    return SiteOptions(WaveOptions(wave_speed, wind, two_way or turn_around is not None, turn_around), height)
 
 
-def run_check(file: Path, method: str, stated: tuple[str | None, str | None] = (None, None)) -> int:
+def run_check(file: Path, method: str, stated: SiteOptions | None = None) -> int:
     """Print the input lines that a stream of a site accepts, and return the exit code 0.
 
-    `stated` has the wave speed and the height of the options, or None.
+    `stated` has the options on the wave and the height, or None.
     """
-    site = _site(file, method, stated)
+    from optloc.service.site import read_site
+
+    site = read_site(file, method, stated)
     for line in input_description(site):
         typer.echo(visible(line))
     return 0

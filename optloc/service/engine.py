@@ -23,6 +23,7 @@ from optloc.service.events import Event
 from optloc.service.metrics import Metrics
 from optloc.service.site import Ready, Site, SiteRow
 from optloc.service.tracks import Following, Scan, Tracks
+from optloc.solvers import PreparedFloors
 
 LOG = logging.getLogger("optloc.service")
 
@@ -35,6 +36,8 @@ PENDING = 256
 PHASES = ("two", "one", "fix")
 """Answers of an event: a fix at once and its proof later, both in one answer after the proof, or no proof."""
 
+# Reason of an event of a track at a site with several floors.
+_ON_FLOORS = "a track needs one height, and the site lists several; state one height, or send the event without a track"
 # Number of groups of events whose values are checked: a wrong unit is the same in all events.
 _CHECKED = 8
 
@@ -111,6 +114,7 @@ class Engine:
         self._to_check, self._warned = _CHECKED, set[str]()
         ready = site.ready((), site.rows)
         assert ready is not None  # a site has rows
+        self._untrackable = _ON_FLOORS if isinstance(ready.fast, PreparedFloors) else ""
         self.tracks = Tracks(ready.fast.problem, following or Following(), metrics, self._followed, clock)
         metrics.gauges["proofs"] = lambda: len(self._waiting)
         if phases != "fix":
@@ -130,8 +134,9 @@ class Engine:
         """
         closed = []
         for event in events:
-            if event.refused:
-                self._fail(event, event.refused)
+            refused = event.refused or (self._untrackable if event.track else "")
+            if refused:
+                self._fail(event, refused)
             else:
                 closed.append(event)
         followed = [event for event in closed if event.track]

@@ -16,13 +16,13 @@ import numpy as np
 from optloc.engine import Cache
 from optloc.files import (
     FREE,
-    ConstraintTable,
     Draft,
     ProblemFile,
     StatedConstraint,
     Table,
     WaveOptions,
     assemble,
+    height_table,
     join,
     limits_of,
     name_of,
@@ -36,7 +36,7 @@ from optloc.files import (
 from optloc.model_checks import least_values
 from optloc.models import MODELS
 from optloc.problem import Array, Conversion, Frame, InvalidProblem, nearest, no_station
-from optloc.solvers import Prepared, prepare
+from optloc.solvers import Prepared, PreparedFloors, prepare_on_floors
 
 FAST = "gtrs+lsr"
 """The method of the first phase: no proof, about ten microseconds for each fix."""
@@ -74,8 +74,7 @@ class SiteOptions(NamedTuple):
         file = with_options(file, self.wave)
         if self.height is None:
             return file
-        level = ConstraintTable(kind="height", exactly=self.height)
-        return file.model_copy(update={"constraints": [*file.constraints, level]})
+        return file.model_copy(update={"constraints": [*file.constraints, height_table(self.height)]})
 
 
 class SiteRow(NamedTuple):
@@ -105,7 +104,7 @@ class Ready:
 
     Parameters
     ----------
-    fast, full : Prepared
+    fast, full : Prepared or PreparedFloors
         Solvers of the first phase, and of the method of the stream.
     count : int
         Number of rows m of the problem; rows without a value have the weight 0.
@@ -120,8 +119,8 @@ class Ready:
         Least possible values of the rows, SI; minus infinity for no limit.
     """
 
-    fast: Prepared
-    full: Prepared
+    fast: Prepared | PreparedFloors
+    full: Prepared | PreparedFloors
     count: int
     row: Array
     first: Array
@@ -306,8 +305,9 @@ class Site:
             added = np.where(chunk.weight > 0.0, chunk.baseline, 0.0)[given]
             stated.append((column[given] - len(timed), number[given], chunk.unit, added))
         row, first, second = np.array(links, dtype=np.int64).reshape(-1, 3).T
-        fast = prepare(bare, FAST)
-        full = fast if self.method == FAST else prepare(bare, self.method)
+        floors = draft.loaded.floors
+        fast = prepare_on_floors(bare, floors, FAST)
+        full = fast if self.method == FAST else prepare_on_floors(bare, floors, self.method)
         return Ready(
             fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12, least_values(bare)
         )
@@ -436,10 +436,10 @@ def _check(draft: Draft, source: str) -> None:
     if motion - FREE:
         what = f"the motion {min(map(str, motion - FREE))} needs several epochs"
         raise InvalidProblem(what, join(source, "[target]"), "remove it; each event is fixed separately")
+    if any(section.vp_vs is not None for section in draft.file.measurements):
+        what = "a stream cannot use P and S arrivals with one origin time"
+        raise InvalidProblem(what, join(source, "key 'vp_vs'"), "remove it, and send P arrivals")
     for chunk in draft.chunks:
-        if chunk.combination is not None:
-            what = "a stream cannot use P and S arrivals with one origin time"
-            raise InvalidProblem(what, join(source, "key 'vp_vs'"), "remove it, and send P arrivals")
         if chunk.unit.logarithmic:
             where = join(chunk.table.source, "key 'unit'")
             raise InvalidProblem("a stream cannot use ratios in decibels", where, "send ratios, in the unit '1'")

@@ -43,6 +43,7 @@ from optloc.show.columns import (
     records,
 )
 from optloc.show.knowledge import has_place, known_rows
+from optloc.show.origin_time import origin_text
 
 # If an equality fixes a coordinate, its computed sigma is rounding error: below this share of the coordinate.
 _HELD = 1e-12
@@ -123,7 +124,11 @@ def fix_sheet(fix: Fix, columns: Columns | None = None, title: str = "") -> FixS
     if rows > SHOWN:
         lines.append(("...", f"{rows - SHOWN} more; write all of them to a file with --out"))
     # Errors of single epochs, such as clock errors, are too many to list: print their root mean square.
+    origin = origin_text(columns, 0) if rows == 1 else ""
+    lines += [("emission time", origin)] if origin else []
     for name, values in fix.bias.items():
+        if origin and name == "emission":
+            continue
         slot, shared = fix.layout.find(name)
         if not shared and np.isfinite(values).any():
             spread = np.sqrt(np.nanmean(values**2))

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     )
     from optloc.solvers.certificates.admitted import certify as certify
     from optloc.solvers.certificates.relaxations import Reference as Reference, reference_bound as reference_bound
+    from optloc.solvers.floors import PreparedFloors as PreparedFloors, prepare_on_floors as prepare_on_floors
     from optloc.solvers.methods import (
         FORMULATIONS as FORMULATIONS,
         METHODS as METHODS,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from optloc.solvers.pool import Pool as Pool, begin as begin, offer as offer
     from optloc.solvers.posing.convex_program import ConvexProgram as ConvexProgram
     from optloc.solvers.posing.posed import Posed as Posed
+    from optloc.solvers.posing.posed_problem import PosedProblem as PosedProblem
     from optloc.solvers.posing.range_moments import range_rows as range_rows
     from optloc.solvers.prepared import Prepared as Prepared, prepare as prepare
     from optloc.solvers.robust.stage import rejected as rejected

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import join
@@ -15,23 +16,64 @@ from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import claim_sentence
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
+from optloc.solvers.prepared import Prepared, prepare
 from optloc.solvers.solution import solve
 
 
-def at_height(problem: Problem, height: float) -> Problem:
-    """Return a problem with its exact height replaced, metres; raise InvalidProblem if it has no exact height."""
+def on_floors(problem: Problem, floors: Sequence[float]) -> list[Problem]:
+    """Return a problem for each floor: the band of its height becomes an exact height.
 
-    def replaced(band: object) -> bool:
-        """Return whether a constraint is the exact height."""
-        return isinstance(band, Band) and band.name == "height" and np.array_equal(band.lower, band.upper)
+    Floors outside the band, which other constraints may narrow, are left out.
 
-    if not any(map(replaced, problem.constraints)):
-        raise InvalidProblem("the problem has no exact height", "height", "state one height, then several")
+    Parameters
+    ----------
+    problem : Problem
+        A problem whose target has a band of heights, or an exact height.
+    floors : sequence of float
+        Heights, metres.
+
+    Raises
+    ------
+    InvalidProblem
+        If the problem has no band of heights, or if no floor is inside it.
+    """
+    bands = [band for band in problem.constraints if _is_of_height(band)]
+    if not bands:
+        raise InvalidProblem("the problem has no height", "height", "state a height or a band of heights")
+    exact = all(np.array_equal(band.lower, band.upper) for band in bands if isinstance(band, Band))
+    inside = [
+        height
+        for height in floors
+        if exact or all(np.all((b.lower <= height) & (height <= b.upper)) for b in bands if isinstance(b, Band))
+    ]
+    if not inside:
+        listed = ", ".join(f"{height:g}" for height in floors)
+        raise InvalidProblem(f"other constraints exclude the heights {listed} m", "height", "correct one of them")
+    return [_at_height(problem, height) for height in inside]
+
+
+def height_of(problem: Problem) -> float:
+    """Return the exact height of a problem, metres; NaN without one."""
+    exact = (b for b in problem.constraints if isinstance(b, Band) and _is_of_height(b) and b.lower == b.upper)
+    return next((float(band.lower) for band in exact), float("nan"))
+
+
+def _is_of_height(band: object) -> bool:
+    """Return whether a constraint bounds the height: above the ellipsoid, or as the third coordinate."""
+    if not isinstance(band, Band):
+        return False
+    normal = np.asarray(band.coefficients, dtype=float)
+    upward = band.kind == "plane" and normal.shape == (3,) and normal[2] == 1.0 and not normal[:2].any()
+    return band.kind == "height" or upward
+
+
+def _at_height(problem: Problem, height: float) -> Problem:
+    """Return a problem in which the target is exactly at a height, metres."""
     level = np.asarray(height, dtype=float)
     return replace(
         problem,
         constraints=tuple(
-            replace(band, lower=level, upper=level) if isinstance(band, Band) and replaced(band) else band
+            replace(band, lower=level, upper=level) if isinstance(band, Band) and _is_of_height(band) else band
             for band in problem.constraints
         ),
     )
@@ -50,7 +92,43 @@ def solve_on_floors(problems: Sequence[Problem], method: str = "auto") -> Fix:
     method : str
         Method as in `optloc.solve`.
     """
-    fixes = [solve(problem, method) for problem in problems]
+    return best_of_floors([solve(problem, method) for problem in problems])
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedFloors:
+    """Prepared problems that differ in the height of the target, to fix new measurements many times.
+
+    Parameters
+    ----------
+    floors : tuple of Prepared
+        One prepared problem for each floor.
+    """
+
+    floors: tuple[Prepared, ...]
+
+    @property
+    def problem(self) -> Problem:
+        """Return the problem on the first floor."""
+        return self.floors[0].problem
+
+    def __call__(self, z: ArrayLike) -> Fix:
+        """Return the best of the fixes of measurements z (..., m) on all floors."""
+        return best_of_floors([floor(z) for floor in self.floors])
+
+
+def prepare_on_floors(problem: Problem, floors: Sequence[float], method: str) -> Prepared | PreparedFloors:
+    """Return a prepared problem for the heights `floors`, metres; for an empty sequence, the problem itself.
+
+    `problem` and `method` are as for `optloc.prepare`.
+    """
+    if not floors:
+        return prepare(problem, method)
+    return PreparedFloors(tuple(prepare(one, method) for one in on_floors(problem, floors)))
+
+
+def best_of_floors(fixes: Sequence[Fix]) -> Fix:
+    """Return the best of the fixes on several floors, as `solve_on_floors`; `fixes` has one fix for each floor."""
     shape, flat = fixes[0].shape, [fix.flat() for fix in fixes]
     count, floors = len(flat[0]), len(flat)
     every = join(iter(flat), count * floors)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -35,6 +36,7 @@ from optloc.solvers.layered import equations_in_layers, in_every_layer, refine_i
 from optloc.solvers.policy import P_SUSPECT
 from optloc.solvers.pool import Pool, chunk_size, in_parts, least_finished, offer, pack
 from optloc.solvers.starts.best_first import best_first_starts
+from optloc.solvers.starts.course_search import TRIALS, course_search, has_course
 from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
 from optloc.solvers.starts.position import along_the_valley, is_registration_run, spread_of, subarray_starts
@@ -179,10 +181,8 @@ def add_candidates(problem: Problem, pool: Pool | None) -> Pool:
     """Return a pool with more starts: mirror images, and starts of sub-arrays if the verdict has findings."""
     if pool is None:
         raise InvalidProblem("add_candidates needs a fix", "method", "put it after a refinement, as lsr+add_candidates")
-    if is_registration_run(problem):
-        began, fix = perf_counter(), judge(problem, pool)
-        around = step_beside(problem, fix.x, fix.covariance())
-        return _with_starts(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
+    if is_registration_run(problem) or has_course(problem):
+        return _more_courses(problem, pool)
     if not one_position(problem):
         return pool
     return in_parts(problem, lambda part, own: _more_candidates(part, take(pool, own)), chunk_size(problem))
@@ -208,6 +208,23 @@ def _more_candidates(problem: Problem, pool: Pool) -> Pool:
             parts.append(spread)
     fresh = vectors(problem, _far_from_known(problem, fix, seen, np.concatenate(parts, axis=1)))
     return _with_starts(problem, pool, fix, fresh, began)
+
+
+def _more_courses(problem: Problem, pool: Pool) -> Pool:
+    """Return the candidates of a refined pool of runs, and additional starts to refine.
+
+    Weak fixes of runs of ranges get starts along their error ellipsoids. Doubtful courses get starts of a search.
+    """
+    began, fix = perf_counter(), judge(problem, pool)
+    x = step_beside(problem, fix.x, fix.covariance()) if is_registration_run(problem) else pool.x[:, :0]
+    # the search takes as long as all other stages, so it serves answers with a finding only
+    doubtful = np.flatnonzero(fix.answered & (fix.has(*_UNSETTLED) | (fix.p_value < P_SUSPECT)))
+    if len(doubtful) and has_course(problem):
+        found = course_search(problem.take(doubtful), fix.x[doubtful])
+        spread = np.full((len(fix.x), *found.shape[1:]), np.nan)
+        spread[doubtful] = found
+        x = np.concatenate([x, spread], axis=1)
+    return _with_starts(problem, pool, fix, x, began) if np.isfinite(x).any() else pool
 
 
 def _with_starts(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
@@ -280,8 +297,11 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
         )
     elif moves_at_once(problem):
         pool = _search_unanswered(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
+    if has_course(problem):
+        pool = _search_unanswered(problem, pool, course_search, partial(_searched, tried=f"{TRIALS} courses"))
     if one_position(problem):
-        pool = _search_unanswered(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), _searched)
+        positions = partial(_searched, tried=f"{_PLACES} positions")
+        pool = _search_unanswered(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), positions)
     return pool
 
 
@@ -337,9 +357,14 @@ def _with_offsets(problem: Problem, position: Array) -> Array:
     return x
 
 
-def _searched(why: Array) -> dict[str, Any]:
-    """Return fields of a pool for problems searched from many positions; `why` (n,) are their earlier reasons."""
-    remark = np.array([_searched_sentence(each) for each in why], dtype=object)
+def _searched(why: Array, tried: str) -> dict[str, Any]:
+    """Return fields of a pool for problems that a search answered; `why` (n,) are their earlier reasons.
+
+    `tried` is the number and the name of the starts of the search, such as "96 positions".
+    """
+    remark = np.array(
+        [f"{each}; best of a search from {tried}" if each else f"best of {tried}" for each in why], dtype=object
+    )
     return {"searched": np.ones(len(why), dtype=bool), "remark": remark}
 
 
@@ -376,11 +401,6 @@ def _directions(d: int) -> Array:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     # a tenth of the spread is between the stations; at a hundred spreads wave fronts are almost flat
     return direction * 10.0 ** rng.uniform(-1.0, 2.0, (_PLACES, 1))
-
-
-def _searched_sentence(why: str) -> str:
-    """Return the remark on a searched problem, after the reason `why` of its missing start."""
-    return f"{why}; best of a search from {_PLACES} positions" if why else f"best of {_PLACES} positions"
 
 
 def search_widely(problem: Problem) -> Pool:

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 from typer.models import ArgumentInfo, OptionInfo
+from typer.testing import CliRunner
 
 from optloc import InvalidProblem, Status
+from optloc.cli.app import app
 from optloc.cli.options import (
     allowed,
-    complete,
     constraints,
     coordinates,
     example,
@@ -59,6 +60,12 @@ def test_names_are_options_with_flags_and_arguments_without():
     assert isinstance(name_in("motions", "Model"), ArgumentInfo)
 
 
-def test_help_completes_names_and_shows_examples():
-    assert "cv" in complete("motions")("")
+def test_help_shows_examples():
     assert example("optloc demo").count("optloc demo") == 1
+
+
+@pytest.mark.parametrize("words", [[], ["study"]])
+def test_a_group_without_arguments_prints_its_help(words):
+    found = CliRunner().invoke(app, words)
+    assert (found.exit_code, found.stderr) == (0, "")
+    assert "Commands" in found.output or "Answers" in found.output

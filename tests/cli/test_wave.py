@@ -109,10 +109,54 @@ def test_a_list_of_floors(hall):
     words = ("fix", "site.toml", "--wave-speed", "air:20C", "--json")
     (fix,) = json.loads(run(*words, "--height", "1.2 m, 470 cm, 8.2 m").stdout)["fixes"]
     assert (fix["status"], fix["z"]) == ("ok", pytest.approx(1.2))
-    done = run("track", "six.csv", *TABLE, "--wave-speed", "air:20C", "--height", "0 m, 3 m")
-    assert done.exit_code == 2
-    assert "a list of floors is for optloc fix" in done.stderr
     assert run(*words, "--height", "0 m, high").exit_code == 2
+
+
+def test_floors_in_tracks_files_and_sites(hall):
+    done = run("track", "six.csv", *TABLE, "--wave-speed", "air:20C", "--height", "1.2 m, 6 m", "--json")
+    assert done.exit_code == 0, done.output
+    last = json.loads(done.stdout)["scans"][-1]
+    assert (last["x"], last["y"], last["z"]) == pytest.approx((7.0, 4.5, 1.2), abs=0.1)
+    words = (*TABLE, "--wave-speed", "air:20C", "--height", "1.2 m, 6 m", "--out", "out.toml")
+    assert run("convert", "six.csv", *words).exit_code == 0
+    assert 'one_of = ["1.2 m", "6 m"]' in (hall / "out.toml").read_text()
+    fixes = json.loads(run("fix", "out.toml", "--json").stdout)["fixes"]
+    assert {(fix["status"], round(fix["z"], 6)) for fix in fixes} == {("ok", 1.2)}
+    band = load(hall / "out.toml").constraints[0]
+    assert (float(band.lower), float(band.upper)) == (1.2, 6.0)
+    events = [{"event": str(i), "z": [flight(k) for k in ANCHORS]} for i in (1, 2)]
+    (hall / "events.ndjson").write_text("".join(json.dumps(one) + "\n" for one in events))
+    words = ("live", "site.toml", "--replay", "events.ndjson", "-q", "--wave-speed", "air:20C", "--height", "1.2 m, 6")
+    done = run(*words)
+    assert done.exit_code == 0, done.output
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    last = next(record for record in records if "position" in record)
+    assert last["position"] == pytest.approx([5.0, 4.0, 1.2], abs=1e-3)
+    rows = "".join(f'{{ a = "{k}", z = {math.dist((5.0, 4.0, 1.2), place)} }}, ' for k, place in ANCHORS.items())
+    text = (hall / "site.toml").read_text().split("[[measurements]]")[0]
+    (hall / "cart.toml").write_text(f'{text}[[measurements]]\nkind = "range"\nsigma = "5 cm"\nrows = [{rows}]\n')
+    z = [math.dist((5.0, 4.0, 1.2), place) for place in ANCHORS.values()]
+    (hall / "events.ndjson").write_text(json.dumps({"event": "1", "z": z, "time": 5.0}) + "\n")
+    done = run("live", "cart.toml", "--replay", "events.ndjson", "-q", "--height", "1.2 m, 6 m", "--track")
+    assert "a track needs one height" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("constraint", "told"),
+    [
+        ('one_of = ["0 m"]', "at least 2"),
+        ('one_of = ["0 m", 0.0]', "two different heights"),
+        ("one_of = [0.0, 3.0]\nexactly = 1.0", "a list of heights has no 'exactly'"),
+        ('one_of = [0.0, 3.0]\n\n[[constraints]]\nkind = "height"\none_of = [0.0, 5.0]', "listed twice"),
+        ('one_of = [0.0, 3.0]\n\n[[constraints]]\nkind = "height"\nmin = 4.0', "4"),
+    ],
+)
+def test_wrong_lists_of_floors_are_one_sentence(hall, constraint, told):
+    text = (hall / "site.toml").read_text() + f'\n[[constraints]]\nkind = "height"\n{constraint}\n'
+    (hall / "wrong.toml").write_text(text)
+    done = run("fix", "wrong.toml", "--wave-speed", "air:20C")
+    assert done.exit_code == 2
+    assert told in done.stderr
 
 
 def test_wrong_options_are_one_sentence(hall):

@@ -278,3 +278,11 @@ def test_missing_and_unknown_keys():
 def test_only_courses_move(tmp_path):
     assert moves(load(written(tmp_path, document(epochs=3, more=MOVES))).motions[0])
     assert not moves(load(written(tmp_path, document())).motions[0])
+
+
+@pytest.mark.parametrize(("key", "words"), [("z", "in the plane have no z"), ("height", "belongs to lat_deg")])
+def test_a_ball_in_the_plane_does_not_ignore_its_height(key, words):
+    anchors = {name: place[:2] for name, place in PLACES.items()}
+    table = {"kind": "ball", "x": 0.0, "y": 0.0, key: 100.0, "radius": 50.0}
+    with pytest.raises(InvalidProblem, match=words):
+        locate(anchors, ranges=dict.fromkeys(anchors, 900.0), sigma=5.0, constraints=[table])

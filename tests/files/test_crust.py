@@ -29,7 +29,15 @@ def test_the_first_layer_extends_to_the_highest_station(tmp_path):
     assert "surface = 2200.0" in found.medium(2069.0)
     assert "speeds = [4000.0, 6000.0, 6300.0]" in found.medium(2069.0)
     assert found.vp_vs == pytest.approx((4 / 2.3 + 6 / 3.5 + 6.3 / 3.6) / 3)
-    assert "vp / vs is 1.714 to 1.75, and its mean is used in all layers" in found.note
+    assert "vp / vs is 1.714 to 1.75, so P and S waves have separate rays" in found.note
+    assert "s_speeds = [2300.0, 3500.0, 3600.0]" in found.medium(2069.0)
+    assert found.ratio == '"layers"'
+
+
+def test_an_equal_ratio_is_one_number(tmp_path):
+    found = crust(tmp_path, "depth_km,vp_km_s,vs_km_s\n0,4.0,2.31\n2,6.0,3.47\n")
+    assert not any("s_speeds" in line for line in found.medium(0.0))
+    assert float(found.ratio) == pytest.approx(1.73, abs=0.002)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from optloc import InvalidProblem
 from optloc.cli.from_table import table_hints
 from optloc.files import load_table
 from optloc.files.csv_formats import is_log, read_table
+from optloc.problem.noise import variances
 
 SPEEDS = {"vp": f"{VP} m/s", "vs": f"{VS} m/s"}
 
@@ -85,7 +86,34 @@ def test_hypo71_phase_cards(tmp_path):
     assert error < 100.0
     table = read_table(tmp_path / "event.pha")
     assert table.notes[0] == "picks with weight 4 are left out: 1; change their weight to use them"
-    assert "weights 1 to 3 of 3 picks are not used" in table.notes[1]
+    assert "picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight" in table.notes[1]
+
+
+@pytest.mark.parametrize("sigma", ["0.05 s", "p=0.05 s,s=0.05 s", "toa=50 ms"])
+def test_the_variance_is_divided_by_the_weight_of_a_pick(tmp_path, sigma):
+    shares = {0: 1.0, 1: 0.75, 2: 0.5, 3: 0.25}
+    lines = hypo71().splitlines()
+    cards = [i for i, line in enumerate(lines) if "IPU0" in line]
+    for number, i in enumerate(cards):
+        lines[i] = lines[i].replace("IPU0", f"IPU{number % 4}")
+    fix, error = fixed(tmp_path, "event.pha", "\n".join([*lines, ""]), sigma=sigma)
+    assert error < 100.0
+    problem = load_table(tmp_path / "event.pha", stations=tmp_path / "net.csv", **SPEEDS, sigma=sigma)
+    rows = np.flatnonzero(np.concatenate([np.full(one.count, one.kind == "toa") for one in problem.rows]))
+    variance = variances(problem.noise, problem.count)[rows]
+    expected = [(6000.0 * 0.05) ** 2 / shares[number % 4] for number in range(len(cards))]
+    assert variance == pytest.approx(np.array(expected) * (VP / 6000.0) ** 2, rel=1e-6)
+    plain = optloc.solve(load_table(tmp_path / "event.pha", stations=tmp_path / "net.csv", **SPEEDS, sigma=sigma))
+    assert np.allclose(plain.position, fix.position)
+
+
+def test_the_weights_of_both_picks_change_s_minus_p(tmp_path):
+    (tmp_path / "event.pha").write_text(hypo71())
+    (tmp_path / "net.csv").write_text(stations_csv())
+    problem = load_table(tmp_path / "event.pha", stations=tmp_path / "net.csv", **SPEEDS, sigma="0.1 s", what="sp")
+    speed = VP * VS / (VP - VS)
+    # P has full weight, and S has 3/4
+    assert variances(problem.noise, problem.count) == pytest.approx((speed * 0.1) ** 2 * (1.0 + 4.0 / 3.0) / 2.0)
 
 
 def test_nonlinloc_observations_with_their_errors_and_an_s_alone(tmp_path):

@@ -95,3 +95,71 @@ def test_networks_take_times_with_a_wave_speed():
     assert net.sigma == pytest.approx(again.sigma)
     with pytest.raises(InvalidProblem, match="the speed of a network is exact"):
         optloc.sites.calibration.network_of(times, 1e-4, dimension=2, wave_speed="343+-5 m/s")
+
+
+def test_wind_moves_the_wave():
+    stations = {"A": (0.0, 0.0), "B": (500.0, 0.0), "C": (0.0, 500.0), "D": (500.0, 500.0), "E": (250.0, 700.0)}
+    shot, wind, speed = np.array([310.0, 260.0]), np.array([6.0, -3.0]), 340.0
+    line = np.array([*stations.values()]) - shot
+    along, rest = line @ wind, speed**2 - wind @ wind
+    times = (np.sqrt(along**2 + rest * (line**2).sum(1)) - along) / rest
+    toa = dict(zip(stations, times, strict=True))
+    fix = optloc.locate(stations, toa=toa, sigma="1 ms", wave_speed=speed, wind=(6.0, -3.0))
+    assert np.abs(fix.position - shot).max() < 1e-3
+    assert fix.status.label == "ok"
+    compass = "6.7082039325 m/s from 296.56505118"  # from the west-north-west
+    same = optloc.locate(stations, toa=toa, sigma="1 ms", wave_speed=speed, wind=compass)
+    assert np.abs(same.position - shot).max() < 1e-3
+
+
+def test_wind_on_earth_is_towards_east_and_north():
+    places = {"A": (47.0, 8.0), "B": (47.0, 8.01), "C": (47.008, 8.0), "D": (47.008, 8.011), "E": (46.996, 8.005)}
+    times = {name: 1.0 + 0.1 * i for i, name in enumerate(places)}
+    fixes = [
+        optloc.locate(latlon=places, toa=times, sigma="10 ms", wave_speed=340.0, wind=wind)
+        for wind in ((5.0, 0.0), "5 m/s from 270")
+    ]
+    assert np.abs(fixes[0].position - fixes[1].position).max() < 1e-6
+
+
+def test_two_way_times_are_halved_without_the_turn_around():
+    anchors, tag = {"A": (0.0, 0.0), "B": (80.0, 0.0), "C": (0.0, 60.0), "D": (80.0, 60.0)}, np.array([30.0, 20.0])
+    ms = {name: 2.0 * float(np.linalg.norm(tag - place)) / 1500.0 * 1e3 + 15.0 for name, place in anchors.items()}
+    options = {"unit": "ms", "sigma": 0.2, "wave_speed": "1500 m/s"}
+    fix = optloc.locate(anchors, ranges=ms, two_way=True, turn_around="15 ms", **options)
+    assert np.abs(fix.position - tag).max() < 1e-6
+    # 0.2 ms of the way there and back are 0.15 m
+    one = optloc.locate(anchors, ranges={k: 0.75 * (v - 15.0) for k, v in ms.items()}, sigma=0.15)
+    assert np.allclose(one.covariance(), fix.covariance(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"wind": (5.0, 0.0)}, "wind: a wind needs one wave speed"),
+        ({"wind": "west", "wave_speed": 343}, "not a wind"),
+        ({"wind": 5.0, "wave_speed": 343}, "float is not a wind"),
+        ({"wind": (5.0, "a"), "wave_speed": 343}, "is not a wind"),
+        ({"wind": (5.0, 0.0), "wave_speed": (343.0, 5.0)}, "without a sigma"),
+        ({"wind": (500.0, 0.0), "wave_speed": 343}, "above half of the wave speed"),
+        ({"two_way": True, "wave_speed": 343}, "there are no ranges"),
+        ({"turn_around": "2 ms", "wave_speed": 343}, "turn_around: there are no ranges"),
+    ],
+)
+def test_wrong_ways_are_named(options, words):
+    stations = {"A": (0.0, 0.0), "B": (500.0, 0.0), "C": (0.0, 500.0), "D": (500.0, 500.0)}
+    with pytest.raises(optloc.InvalidProblem, match=words):
+        optloc.locate(stations, toa=dict.fromkeys(stations, 0.5), sigma="1 ms", **options)
+
+
+def test_two_way_ranges_are_times_without_wind():
+    stations = {"A": (0.0, 0.0), "B": (500.0, 0.0), "C": (0.0, 500.0)}
+    ranges = dict.fromkeys(stations, 350.0)
+    with pytest.raises(optloc.InvalidProblem, match="two-way ranges are times, but the unit is m"):
+        optloc.locate(stations, ranges=ranges, sigma=1.0, two_way=True)
+    with pytest.raises(optloc.InvalidProblem, match="there and back"):
+        optloc.locate(stations, ranges=ranges, sigma=1.0, two_way=True, wind=(1.0, 0.0), wave_speed=343.0, unit="ms")
+    with pytest.raises(optloc.InvalidProblem, match="the wind has no effect"):
+        optloc.locate(stations, ranges=ranges, sigma=1.0, wind=(1.0, 0.0), wave_speed=343.0)
+    with pytest.raises(optloc.InvalidProblem, match="negative"):
+        optloc.locate(stations, ranges=ranges, sigma=1.0, two_way=True, unit="ms", turn_around="-2 ms")

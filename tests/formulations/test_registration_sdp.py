@@ -161,8 +161,10 @@ def test_blocks_of_windows_are_the_whole_lift(moving):
         assert np.linalg.norm((found.target - data.place(place))[0]) < 0.01 * np.linalg.norm(target[0])
 
 
+@pytest.mark.parametrize("less", [False, True])
 @pytest.mark.parametrize(("dimension", "moving", "clocks"), [(3, False, False), (3, True, True), (2, False, True)])
-def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clocks):
+def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clocks, less):
+    """In the remainders themselves, or in half of the remainders less their biases."""
     rng = np.random.default_rng(0)
     design = np.concatenate([-np.ones((4, 1)), np.eye(4)], axis=1) if clocks else np.eye(4)
     bias = 50 * rng.normal(size=design.shape[1])
@@ -172,7 +174,8 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
     one = run(rng, 3.0, bias=bias, design=design, **scene)
     station, z, whiten, time = one.windows(4)
     data = RegistrationWindows.of(station, z, whiten, one.sigma, design, 10.0, time if moving else None)
-    problem = registration_problem(4, 5, dimension, int(moving), len(bias))
+    change = np.block([[np.eye(1, len(bias) + 5, len(bias))], [design, np.zeros((4, 1)), 2.0 * np.eye(4)]])
+    problem = registration_problem(4, 5, dimension, int(moving), len(bias), change if less else None)
     target = one.truth + 0.1 * one.truth * rng.normal(size=one.truth.shape)
     y, near, left_over = lifted(data, target, bias)
     weight = np.kron(data.power.T @ data.power / 4, np.eye(dimension))
@@ -180,6 +183,7 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
         parameter.value = {**_parameters(data), "price": 0.7 * weight}[parameter.name()]
     cost, shift = data.cost(y[1:])
     shared = np.append(y, shift)
+    left_over = 0.5 * (left_over - design @ shift) if less else left_over
     for variable in problem.variables():
         name, _, k = variable.name().partition(" ")
         own = np.append(near[int(k)], left_over[int(k)]) if k else shared

@@ -20,7 +20,7 @@ from formulations.squared_range import cone, minimiser, paraboloid
 from formulations.squared_range_conic import hull, shor
 from formulations.unit_scale import PointScale, RowScale, power_of_two
 
-UNITS = (1e-3, 1.0, 1e3, 1e6)
+UNITS = (1e-3, 1e6, 1.0, 1e3)
 # The error of a solver's value at its tolerance of 1e-10, relative to the squares of the rows.
 ROUNDING = 1e-7
 
@@ -41,7 +41,7 @@ def squared_ranges(seed, unit, shape, shift=0.0):
     return B / spread[:, None], g / spread, (paraboloid if shape == "paraboloid" else cone)(d)
 
 
-@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("unit", few(UNITS, 2))
 @pytest.mark.parametrize("shape", ["paraboloid", "cone"])
 def test_no_dual_bound_is_above_the_optimum(shape, unit):
     """The optimum by the GTRS, which solves no cone program; outside unit scale all bounds were above it."""
@@ -151,7 +151,7 @@ def test_other_formulations_do_not_depend_on_the_unit(seed):
         np.testing.assert_allclose(found[1], loose, rtol=3e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
+@pytest.mark.parametrize("unit", few([1e-3, 1e6, 1e3], 2))
 def test_formulations_that_scale_their_own_numbers(unit):
     """Moments in a box, Doppler shifts, a fix on an ellipsoid: the same answer, and no bound above a point's cost."""
     rng = np.random.default_rng(4)

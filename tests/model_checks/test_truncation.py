@@ -6,6 +6,7 @@ import numpy as np
 from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import constraints
+from optloc.base.records import take
 from optloc.model_checks.truncation import are_near, covariance_of, departure_inwards, has_law, law_of
 
 
@@ -43,3 +44,14 @@ def test_a_fix_on_the_side_of_a_box_has_a_half_normal_law():
 
 def test_a_side_far_away_leaves_no_law():
     assert law_of(boxed([0.0, -np.inf]), PLACE[None], np.eye(2)[None], np.zeros((1, 2))) is None
+
+
+def test_points_on_the_edge_of_a_keep_out_polygon_are_admitted():
+    corners = PLACE + np.array([[3.0, -200.0], [60.0, 0.0], [3.0, 200.0]])
+    problem = replace(ranges_to(PLACE, 1.0), constraints=constraints.keep_out_polygon(corners))
+    law = take(law_of(problem, PLACE[None], 9.0 * np.eye(2)[None], np.zeros((1, 2))).truncated, 0)
+    # rounding puts most points of an edge on either side of it
+    edge = np.column_stack([np.full(99, 3.0), np.linspace(-9.0, 9.0, 99)])
+    assert law.admits(edge).all()
+    assert np.isfinite(law.distance_squared(edge)).all()
+    assert not law.admits(edge + np.array([0.01, 0.0])).any()

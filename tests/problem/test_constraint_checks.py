@@ -85,3 +85,34 @@ def test_bands_on_one_quantity_are_together():
     region = Polygon(np.array([[0, 0], [1, 0], [0, 1.0]]))
     groups = bands_by_quantity([*first, region, *second, other])
     assert [[band.lower.item() for band in group] for group in groups] == [[0.0, -1.0], [1.0, -np.inf], [0.0]]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("disc", "str is no constraint"),
+        ([None], "NoneType is no constraint"),
+        ({"kind": "disc"}, "dict is no constraint"),
+        (replace(DISC, target="A"), "no whole number"),
+        (replace(DISC, name=3), "the name is no text"),
+        ([constraints.band([1, 0], 5, 5), constraints.band([-1, 0], -5, -5)], "determine it already"),
+        ([constraints.band([a, b], c, c) for a, b, c in [(1, 0, 5), (0, 1, 5), (1, 1, 10)]], "determine it already"),
+        ([constraints.annulus([x, 0], 5, 5) for x in (1, 2, 3)], "more than the 2 coordinates"),
+    ],
+)
+def test_arguments_that_are_no_constraints_and_equalities_that_depend_are_refused(given, words):
+    rows = measured("range", np.full(4, 5.0), a=np.arange(4), sigma=1.0)
+    with pytest.raises(InvalidProblem, match=words):
+        assemble(PLANE, rows, constraints=given)
+
+
+def test_constraints_can_be_nested():
+    nested = assemble(
+        PLANE, measured("range", np.full(4, 5.0), a=np.arange(4), sigma=1.0), constraints=[[(DISC,)], [[DISC]]]
+    )
+    assert nested.constraints == (DISC, DISC)
+
+
+def test_a_box_has_as_many_lower_as_upper_limits():
+    with pytest.raises(InvalidProblem, match="2 lower and 1 upper"):
+        box((0.0, 0.0), (1.0,))

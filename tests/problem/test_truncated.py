@@ -7,6 +7,7 @@ import optloc
 from optloc import Status, assemble, constraints, measured, solve, station_array
 from optloc.problem.chart import quantile
 from optloc.problem.truncated import Truncated
+from optloc.show.columns import fix_detail
 from optloc.uncertainty import mixture, samples
 from optloc.uncertainty.outline import outline_of
 
@@ -184,3 +185,15 @@ def test_a_fix_at_an_exact_height_covers_truths_of_its_surface():
     inside = fix.covers(truth).mean()
     assert 0.86 <= inside <= 1.0
     assert not fix.covers(truth + np.array([0.0, 0.0, 300.0])).any()
+
+
+def test_the_law_of_a_region_without_planes_has_moments_for_one_fix_and_in_a_batch():
+    anchors = np.array([[-400, -300], [500, -350], [450, 400], [-350, 450], [50, 600], [0, -550.0]])
+    truth, corners = np.array([112.0, 90.0]), [[100, 80], [130, 80], [130, 100], [100, 100]]
+    z = np.linalg.norm(anchors - truth, axis=1) + 5.0 * np.random.default_rng(2).normal(size=6)
+    pond = constraints.keep_out_polygon(corners)
+    fix = solve(assemble(anchors, measured("range", z, a=np.arange(6), sigma=5.0), constraints=pond))
+    mean, covariance = fix.gaussian()
+    assert np.isfinite(covariance).all()
+    np.testing.assert_allclose(mean, fix.reshape((1,)).gaussian()[0][0])
+    assert fix_detail(fix)["chart"]["mean"] == pytest.approx(mean, abs=1e-3)

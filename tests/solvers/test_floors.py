@@ -6,7 +6,7 @@ import pytest
 from optloc import InvalidProblem, locate
 from optloc.linear import constraints
 from optloc.problem.build import assemble, measured, station_array
-from optloc.solvers.floors import at_height, solve_on_floors
+from optloc.solvers.floors import height_of, on_floors, prepare_on_floors, solve_on_floors
 
 ANCHORS = {"A": (0.0, 0.0, 4.0), "B": (20.0, 0.0, 4.0), "C": (20.0, 12.0, 4.0), "D": (0.0, 12.0, 4.0)}
 PLACES = np.array(list(ANCHORS.values()))
@@ -51,19 +51,34 @@ def test_two_heights_of_a_list_stay_a_band():
         locate(ANCHORS, ranges=ranges((5.0, 5.0, 1.0)), sigma=0.05, height=set())
 
 
-def test_the_exact_height_of_a_problem_is_replaced():
+def hall(low, high, **more):
+    """Return a problem with ranges from a target at (5, 5, 7), between two heights."""
     rows = measured("range", np.array(list(ranges((5.0, 5.0, 7.0)).values())), a=np.arange(4), sigma=0.05)
-    bands = constraints.box([-np.inf, -np.inf, 1.0], [np.inf, np.inf, 1.0])[2:]
-    problem = assemble(station_array(PLACES), rows, constraints=bands)
-    with pytest.raises(InvalidProblem, match="no exact height"):
-        at_height(problem, 2.0)
-    named = assemble(station_array(PLACES), rows, constraints=[replace_name(bands[0])])
-    fix = solve_on_floors([at_height(named, h) for h in (0.0, 7.0, 14.0)])
-    assert fix.position[2] == pytest.approx(7.0)
+    bands = constraints.box([-np.inf, -np.inf, low], [np.inf, np.inf, high])[2:]
+    return assemble(station_array(PLACES), rows, constraints=bands, **more)
 
 
-def replace_name(band):
-    """Return a band with the name of a height."""
-    from dataclasses import replace
+def test_the_height_of_a_problem_is_replaced():
+    for problem in (hall(1.0, 1.0), hall(0.0, 14.0)):
+        fix = solve_on_floors(on_floors(problem, (0.0, 7.0, 14.0)))
+        assert fix.position[2] == pytest.approx(7.0)
+    assert height_of(on_floors(hall(0.0, 14.0), (7.0,))[0]) == 7.0
+    assert np.isnan(height_of(hall(0.0, 14.0)))
 
-    return replace(band, name="height")
+
+def test_floors_outside_the_band_are_left_out():
+    assert len(on_floors(hall(0.0, 8.0), (0.0, 7.0, 14.0))) == 2
+    with pytest.raises(InvalidProblem, match="other constraints exclude the heights 9, 14 m"):
+        on_floors(hall(0.0, 8.0), (9.0, 14.0))
+    bare = assemble(station_array(PLACES), measured("range", np.ones(4), a=np.arange(4), sigma=0.05))
+    with pytest.raises(InvalidProblem, match="has no height"):
+        on_floors(bare, (2.0, 3.0))
+
+
+def test_prepared_floors_fix_new_measurements():
+    ready = prepare_on_floors(hall(0.0, 10.5), (1.0, 10.5), "auto")
+    z = np.array([list(ranges(target).values()) for target in ((5.0, 5.0, 1.0), (9.0, 3.0, 10.5))])
+    fix = ready(z)
+    assert fix.position == pytest.approx(np.array([(5.0, 5.0, 1.0), (9.0, 3.0, 10.5)]), abs=1e-6)
+    assert [status.label for status in fix.statuses] == ["ok"] * 2
+    assert prepare_on_floors(hall(1.0, 1.0), (), "auto").problem.count == 4

@@ -58,7 +58,7 @@ def test_rows_hold_exactly_at_the_truth(name):
     problem, truth = blank(name)
     flat = problem.with_rows(z=predict(problem, truth)[None])
     lifts = row_wise(flat)
-    place = (truth[:3] - lifts.origin[0]) / lifts.scale[0]
+    place = (truth[:3] - lifts.coordinates.origin[0]) / lifts.coordinates.scale[0]
     used = np.flatnonzero((lifts.rows[0] != 0.0).any(0))
     beyond = used[used > 2]
     rest = lifts.right[0] - lifts.rows[0, :, :3] @ place

@@ -8,7 +8,7 @@ from typing import Annotated, cast, get_args
 import typer
 from rich.table import Table
 
-from optloc.cli import Force, Quiet, Screen, Verbose, example, name_in
+from optloc.cli import Force, Quiet, Screen, Verbose, choice, example, name_in
 from optloc.files import claim, make_folder
 from optloc.problem import InvalidProblem, nearest
 
@@ -17,9 +17,7 @@ EXAMPLES = example("optloc reproduce registration", "optloc reproduce registrati
 
 def reproduce(
     name: Annotated[str, name_in("papers", "Paper")],
-    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
-        "quick"
-    ),
+    size: Annotated[str, choice("quick|full", "Two minutes, or the sample sizes of the paper.", "--size")] = ("quick"),
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of tables and pictures; optloc-NAME by default.")
     ] = None,

@@ -41,7 +41,6 @@ _MOST_JOBS = 1024
 
 study = typer.Typer(
     cls=CommandGroup,
-    no_args_is_help=True,
     rich_markup_mode="rich",
     epilog=example("optloc list studies", "optloc study run divergence --out divergence"),
     help="Compare methods and solvers over scenarios, noise levels and many trials.",

@@ -50,6 +50,11 @@ def check_order(lower: float, upper: float, name: str, unit: str) -> None:
         raise InvalidProblem(what, name, "correct the limits, they contradict each other")
 
 
+def least_of(value: float) -> Array:
+    """Return a least distance or speed; zero or less is no limit, and at zero the gradient does not exist."""
+    return float_array(value if value > 0.0 else -np.inf)
+
+
 def numbers_of(values: Any, name: str) -> Array:
     """Return an array of floats; raise InvalidProblem for anything else."""
     try:

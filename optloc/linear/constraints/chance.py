@@ -10,10 +10,11 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
-from optloc.base.types import Array, Band, Motion, Stations
+from optloc.base.types import Array, Band, Fence, Motion, Stations
 from optloc.linear.constraints.quantities import is_exact, needs_velocity
 from optloc.linear.constraints.violation import violation
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
+from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
@@ -84,6 +85,9 @@ def _position_name(fix: Fix, demands: tuple[Any, ...]) -> str:
         if is_exact(one):
             what = f"the constraint {one.name!r} is an equality, whose probability is zero"
             raise InvalidProblem(what, "region", "give a lower and an upper bound")
+        if isinstance(one, Fence):
+            what = f"{one.name!r} is an uncertain fence, which has no edge"
+            raise InvalidProblem(what, "region", "give a half-plane")
     targets = {one.target for one in demands}
     if len(targets) > 1:
         raise InvalidProblem("the region belongs to several targets", "region", "give the constraints of one target")
@@ -100,6 +104,7 @@ def _frame_for(fix: Fix, demands: tuple[Any, ...]) -> Problem:
     d = fix.take(next(s.name for s in fix.layout.shared if s.name.partition("[")[0] == "position")).shape[-1]
     stations = Stations(np.zeros((1, 1, d)), ("none",))
     problem = Problem(stations, (), Noise(()), np.zeros(1), (Motion(),), frame=fix.frame, constraints=demands)
+    check_constraints(problem)
     if problem.batch_shape not in ((), fix.shape):
         what = f"the region has batch axes {problem.batch_shape}, and the fix has {fix.shape}"
         raise InvalidProblem(what, "region", "give numbers without batch axes, or with the batch axes of the fix")
@@ -110,7 +115,7 @@ def _chance(fix: Fix, i: tuple[int, ...], frame: Problem, position: Array, covar
     """Return the probability of the region for fix number i with its position (d,) and covariance (d, d)."""
     if fix.chart is None:
         points, weight = _gaussian(np.zeros_like(position), covariance).nodes()
-        return _share(frame, position + points, weight) if len(frame.constraints) else np.nan
+        return _share(frame, position + points, weight)
     chart = take(fix.chart, i)
     if chart.kind == CURVED:
         return np.nan

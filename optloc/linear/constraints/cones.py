@@ -57,8 +57,9 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array, information:
             reach = TOLERANCE * (1.0 + np.abs(constraint.vertices).max())
             out &= distances_from_edges(constraint, points)[:, level.side] <= reach
             # at a concave corner, both sides are admitted, and the cost decreases along one of them
-            here = [other.side for other in face if other.constraint == level.constraint]
-            out &= len(here) < 2 or not is_reflex(constraint, level.side if here[0] == level.side else _first(here))
+            same = [other.side for other in face if other.constraint == level.constraint]
+            edges = [side for side in same if isinstance(side, int)]
+            out &= len(edges) < 2 or not is_reflex(constraint, edges[0])
     unions = [i for i in dict.fromkeys(level.constraint for level in face) if _is_union(problem, i)]
     if unions and out.any():
         items = np.flatnonzero(out)
@@ -66,12 +67,6 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array, information:
         scale = None if information is None else information[items]
         out[items] = _is_held_by_all(part, face, unions, x[items], descent[items], scale)
     return out
-
-
-def _first(sides: list[str | int | tuple[int, int, str]]) -> int:
-    """Return the number of the first of two edges."""
-    assert isinstance(sides[0], int)
-    return sides[0]
 
 
 def _is_union(problem: Problem, i: int) -> bool:

@@ -14,6 +14,7 @@ from optloc.linear.constraints.arguments import (
     check_order,
     direction_of,
     float_array,
+    least_of,
     metres,
     numbers_of,
     point_of,
@@ -122,7 +123,7 @@ def annulus(
     """
     most, least = radius_of(outer, name), float(metres(inner, name))
     check_order(least, most, name, "m")
-    return _within(point_of(centre, (2,), name), least if least > 0.0 else -np.inf, most, target, name)
+    return _within(point_of(centre, (2,), name), least_of(least), most, target, name)
 
 
 def keep_out_disc(
@@ -292,6 +293,6 @@ def quantity(
     return (Band(kind, least, most, numbers_of(coefficients, name or kind), name or kind, target, along, other, table),)
 
 
-def _within(centre: Array, lower: float, upper: float, target: int, name: str) -> tuple[Band, ...]:
+def _within(centre: Array, lower: float | Array, upper: float, target: int, name: str) -> tuple[Band, ...]:
     """Return the constraint that the distance from a point is between two limits, metres."""
     return (Band("distance", float_array(lower), float_array(upper), centre, name, target),)

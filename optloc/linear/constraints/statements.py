@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Amount, Array, Band, Motion
 from optloc.base.units import in_si
-from optloc.linear.constraints.arguments import check_order, float_array, metres, rate_of
+from optloc.linear.constraints.arguments import check_order, float_array, least_of, metres, rate_of
+
+# Standard gravity, m/s^2: exact by definition (CGPM 1901).
+_GRAVITY = 9.80665
 
 
 def box(
@@ -28,6 +31,9 @@ def box(
         Name in reports, before the name of the axis.
     """
     d = len(lower)
+    if d != len(upper) or d > len("xyz"):
+        what = f"the box has {d} lower and {len(upper)} upper limits"
+        raise InvalidProblem(what, name or "box", "give two or three of each, infinite for none")
     return tuple(
         Band("plane", metres(low, "box"), metres(high, "box"), np.eye(d)[i], f"{name} {'xyz'[i]}".strip(), target)
         for i, (low, high) in enumerate(zip(lower, upper, strict=True))
@@ -123,7 +129,7 @@ def reported(
     share = place - before
     at_reference = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
     rate = np.gradient(heights, times, axis=-1) if last else np.zeros_like(heights)
-    half = float(in_si(within, "length", "within", place=True))
+    half = float(metres(within, "within"))
     rise = np.stack([heights - at_reference[..., None], rate], axis=-1)
     motion = Motion(order, reference=reference, over="ground", rise=rise)
     return motion, height(at_reference - half, at_reference + half, target=target, name=name)
@@ -172,8 +178,7 @@ def speed(
     """
     most, least = float(in_si(upper, "speed", name)), float(in_si(lower, "speed", name))
     check_order(least, most, name, "m/s")
-    # A lower bound of zero is left out: no speed is negative, and at zero the gradient does not exist.
-    low = float_array(least if least > 0.0 else -np.inf)
+    low = least_of(least)
     if not along:
         return (Band("speed", low, float_array(most), np.zeros(0), name, target),)
     greatest = Band("speed", float_array(-np.inf), float_array(most), np.zeros(0), name, target, along=True)
@@ -198,10 +203,6 @@ def acceleration(upper: Amount, *, target: int = 0, name: str = "acceleration") 
     if not most > 0.0:
         raise InvalidProblem(f"the greatest acceleration is {most:g} m/s^2", name, "give a positive number")
     return (Band("acceleration", float_array(-np.inf), float_array(most), np.zeros(0), name, target),)
-
-
-# Standard gravity, m/s^2: exact by definition (CGPM 1901).
-_GRAVITY = 9.80665
 
 
 def turn_rate(
@@ -260,7 +261,7 @@ def separation(
     check_order(least, most, name, "m")
     if most <= 0.0:
         raise InvalidProblem("the greatest distance is not positive", name, "give a positive number of metres")
-    low, high = float_array(least if least > 0.0 else -np.inf), float_array(most)
+    low, high = least_of(least), float_array(most)
     none, free = np.zeros(0), float_array(np.inf)
     if not along or least == most:
         return (Band("separation", low, high, none, name, first, along=along, other=second),)

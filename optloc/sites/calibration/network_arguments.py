@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from optloc.engine import numbers
+from optloc.files import Units
 from optloc.models import kind_named
 from optloc.problem import Amount, InvalidProblem, nearest
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked, network_speed
@@ -31,6 +32,8 @@ def network_of(
     distances: Sequence[tuple[int, int, float, float]] = (),
     labels: Sequence[str] | None = None,
     wave_speed: Amount | None = None,
+    two_way: bool = False,
+    turn_around: Amount | None = None,
 ) -> Network:
     """Return a network with one kind of measurements.
 
@@ -60,6 +63,10 @@ def network_of(
         Names of the pulses.
     wave_speed : float or str, optional
         Wave speed, m/s or text such as "air:20C". If it is given, `z` and `sigma` are times in seconds.
+    two_way : bool
+        Whether ranges are times of the way there and back; needs `wave_speed`.
+    turn_around : float or str, optional
+        Time between arrival and reply at the other end, seconds or text such as "2 ms", for two-way times.
 
     Returns
     -------
@@ -78,6 +85,8 @@ def network_of(
     """
     kind = kind_named(kind)
     metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed")
+    if two_way or turn_around is not None:
+        metres, z = 0.5 * metres, np.asarray(z, dtype=float) - _pause(kind, wave_speed, turn_around)
     z, sigma = metres * np.asarray(z, dtype=float), metres * np.asarray(sigma, dtype=float)
     if kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
@@ -116,3 +125,17 @@ def network_of(
         tuple(labels) if labels is not None else tuple(str(j) for j in range(len(values))),
     )
     return plausible(checked(made))
+
+
+def _pause(kind: str, wave_speed: Amount | None, turn_around: Amount | None) -> float:
+    """Return the turn-around time of two-way ranges, s; raise InvalidProblem for other kinds or without a speed."""
+    place = "two_way" if turn_around is None else "turn_around"
+    if kind != "range":
+        raise InvalidProblem(f"{kind} has no way back", place, 'remove this argument; it is for kind="range"')
+    if wave_speed is None:
+        what = "two-way ranges are times, which need a wave speed"
+        raise InvalidProblem(what, place, 'add wave_speed="air:20C"')
+    pause = 0.0 if turn_around is None else Units("time").plain(turn_around, "s", "turn_around")
+    if not pause >= 0.0:
+        raise InvalidProblem("the turn-around time is negative", "turn_around", 'write it as "2 ms"')
+    return pause

@@ -33,6 +33,7 @@ from optloc.files import (
     validated,
     values_of,
     with_standard_columns,
+    without_turn_around,
     write_text,
 )
 from optloc.models import MODELS, kind_named
@@ -78,6 +79,10 @@ class NetworkRows(DataTable):
     """Unit of z: a length or a time."""
     sigma: Amount | None = None
     """Standard deviation of each row, if there is no column sigma."""
+    two_way: bool = False
+    """Whether ranges are times of the way there and back."""
+    turn_around: Amount | None = None
+    """Time from arrival to reply at the other end of two-way ranges: "2 ms"."""
 
 
 class NetworkFile(_NetworkTable):
@@ -93,12 +98,16 @@ class NetworkFile(_NetworkTable):
     measurements: list[NetworkRows] = Field(min_length=1)
 
 
-def read_network(path: Path, wave_speed: str | None = None) -> Network:
+def read_network(
+    path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
+) -> Network:
     """Return the network of a file; see `load_network`."""
-    return load_network(path, wave_speed)[0]
+    return load_network(path, wave_speed, two_way=two_way, turn_around=turn_around)[0]
 
 
-def load_network(path: Path, wave_speed: str | None = None) -> tuple[Network, tuple[str, ...]]:
+def load_network(
+    path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
+) -> tuple[Network, tuple[str, ...]]:
     """Return the network of a file, and sentences about values that are physically suspicious.
 
     Parameters
@@ -107,6 +116,10 @@ def load_network(path: Path, wave_speed: str | None = None) -> tuple[Network, tu
         The file.
     wave_speed : str, optional
         Wave speed that replaces the speed of the file, such as "air:20C".
+    two_way : bool
+        Whether all ranges are times of the way there and back, whatever the file states.
+    turn_around : str, optional
+        Time between arrival and reply at the other end of two-way ranges, such as "2 ms".
 
     Raises
     ------
@@ -127,7 +140,13 @@ def load_network(path: Path, wave_speed: str | None = None) -> tuple[Network, tu
     )
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _prior_places(file.stations, table, where)
-    read = [_section_rows(section, i, folder, source, names, speed) for i, section in enumerate(file.measurements)]
+    if (two_way or turn_around is not None) and all(section.kind != "range" for section in file.measurements):
+        option = "--two-way" if two_way else "--turn-around"
+        raise InvalidProblem("the file has no ranges", option, "remove this option")
+    read = [
+        _section_rows(section, i, folder, source, names, speed, (two_way, turn_around))
+        for i, section in enumerate(file.measurements)
+    ]
     rows, apart = ([one for one in read if (one[0] == BETWEEN) is between] for between in (False, True))
     if not rows:
         raise InvalidProblem("the file has no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
@@ -163,9 +182,18 @@ _Rows = tuple[str, Array, Array, Array, Array, Array]
 
 
 def _section_rows(
-    section: NetworkRows, number: int, folder: Path, source: str, names: tuple[str, ...], speed: float
+    section: NetworkRows,
+    number: int,
+    folder: Path,
+    source: str,
+    names: tuple[str, ...],
+    speed: float,
+    options: tuple[bool, str | None],
 ) -> _Rows:
-    """Return the rows of the section with this number; raise InvalidProblem for wrong rows, such as negative ranges."""
+    """Return the rows of the section with this number; raise InvalidProblem for wrong rows, such as negative ranges.
+
+    `options` are the options on two-way times: whether ranges are such times, and their turn-around time.
+    """
     place_of = join(source, f"[[measurements]] {number + 1}")
     table = table_of(section, folder, place_of)
     between = section.kind == BETWEEN
@@ -175,7 +203,9 @@ def _section_rows(
     kind = BETWEEN if between else kind_named(section.kind, place_of)
     if not between and kind not in KINDS:
         raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
-    read = Context(MeasurementsTable(sigma=section.sigma), table, names, place_of, speed, values=True)
+    ways = _ways(section, kind, place_of, two_way=options[0], turn_around=options[1])
+    settings = MeasurementsTable(sigma=section.sigma, two_way=ways[0], turn_around=ways[1])
+    read = Context(settings, table, names, place_of, speed, values=True)
     z, sigma = _values_and_sigmas(read, section.unit)
     a, b = ends_of(read, kind, 2 if between else MODELS[kind].stations)
     if kind in ("range", BETWEEN):
@@ -210,13 +240,33 @@ def _optional_column(table: Table, key: str) -> Array:
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
 
 
+def _ways(
+    section: NetworkRows, kind: str, where: str, *, two_way: bool, turn_around: str | None
+) -> tuple[bool, Amount | None]:
+    """Return whether the rows of a section are two-way times, and their turn-around time.
+
+    `two_way` and `turn_around` replace the keys of ranges. Raise InvalidProblem for these keys with other kinds.
+    """
+    stated = section.two_way or section.turn_around is not None
+    if kind != "range":
+        if stated:
+            key = "two_way" if section.two_way else "turn_around"
+            advice = "remove it; it is for range"
+            raise InvalidProblem(f"{section.kind} has no way back", join(where, f"key {key!r}"), advice)
+        return False, None
+    pause = section.turn_around if turn_around is None else turn_around
+    return stated or two_way or turn_around is not None, pause
+
+
 def _values_and_sigmas(read: Context, name: str) -> tuple[Array, Array]:
     """Return values (m,) and standard deviations (m,) of the rows of one section, metres.
 
     `read` contains its table, and `name` is the unit in the file.
     """
-    units = Units("length", read.speed)
+    both_ways = read.section.two_way
+    units = Units("length", 0.5 * read.speed if both_ways else read.speed)
     unit = units.conversion(name, join(read.where, "key 'unit'"))
+    unit = without_turn_around(read, unit, units.name(name)) if both_ways else unit
     z = values_of(read, unit, np.ones(read.table.count))
     sigma = sigma_of(read, units, unit, z)
     if sigma is None:

@@ -10,47 +10,38 @@ import numpy as np
 
 from formulations.metric_upgrade import unknowns, upgrade
 from formulations.nuclear_norm import affine_network, nuclear_data, nuclear_offsets, nuclear_problem, truncated_slope
-from optloc.problem import Array, InvalidProblem
+from optloc.problem import Array, InvalidProblem, PosedSolution
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood
 from optloc.sites.calibration.network import Network
 from optloc.sites.calibration.restarts import starts_of
-from optloc.solvers import ConvexProgram
+from optloc.solvers import ConvexProgram, PosedProblem
 
 
-@dataclass(frozen=True, slots=True)
-class RelaxedNetwork:
-    """The solution of a posed network.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelaxedNetwork(PosedSolution):
+    """The solution of a posed network; bound, duals, values and report are as in `optloc.problem.PosedSolution`.
 
     Parameters
     ----------
+    value : float
+        Objective: square metres, unless the objective is your own; NaN without a solution.
     emission : array (N,)
         Times of emission times the propagation speed, metres; NaN without a solution.
     estimate : NetworkEstimate, optional
         Minimum of the likelihood that least squares reaches from these times; None if they give no network.
     cost : float
         Its chi-square; NaN without an estimate.
-    value : float
-        Objective: square metres, unless the objective is your own.
-    bound : float
-        Lower bound of the objective, recomputed from a dual point; NaN without one.
-    duals, values : mapping of str to float or array
-        Multiplier, and left side minus right side in SI units, of each named constraint.
-    backend : formulations.solver_report.SolverReport
-        Report of the back end.
     """
 
     emission: Array
     estimate: NetworkEstimate | None
     cost: float
-    value: float
-    bound: float
-    duals: Mapping[str, float | Array]
-    values: Mapping[str, float | Array]
-    backend: Any
 
 
-class PosedNetwork:
-    """The nuclear norm of a network; see `pose_network`.
+class PosedNetwork(PosedProblem):
+    """The nuclear norm of a network, with relations such as ``posed.emission[1] - posed.emission[0] >= 300``.
+
+    See `pose_network`.
 
     Attributes
     ----------
@@ -71,37 +62,11 @@ class PosedNetwork:
             parameter.value = data[parameter.name()]
         (offset,) = program.variables()
         length = unit * self._starts.spread
-        self._convex, self.emission = ConvexProgram(program, length**2), self._starts.shift + length * offset
-
-    @property
-    def problem(self) -> Any:
-        """Return the relaxation as a cvxpy problem."""
-        return self._convex.problem
-
-    def add(self, constraint: Any, *, name: str | None = None) -> None:
-        """Add a relation of cvxpy between times of emission.
-
-        Parameters
-        ----------
-        constraint : cvxpy relation
-            For instance ``posed.emission[1] - posed.emission[0] >= 300``.
-        name : str, optional
-            Name for duals and messages.
-
-        Raises
-        ------
-        InvalidProblem
-            If it is not a convex relation of this problem, or if its name is in use.
-        """
-        label = name or f"constraint {1 + len(self._convex.relations)}"
-        if label in self._convex.relations:
-            raise InvalidProblem(f"there is already a constraint {label!r}", "name", "give each its own name")
-        self._convex.relations[label] = self._convex.relation(constraint, label)
-        self._convex.restate()
-
-    def minimise(self, expression: Any) -> None:
-        """Replace the objective by a convex expression of your own; raise InvalidProblem for any other expression."""
-        self._convex.minimise(expression)
+        self.emission = self._starts.shift + length * offset
+        self._convex = ConvexProgram(
+            program, length**2, example="posed.emission[0] <= 300", instead="use a convex expression"
+        )
+        super().__init__(self._convex)
 
     def solve(self, solver: str = "CLARABEL", settings: Mapping[str, Any] | None = None) -> RelaxedNetwork:
         """Return the times of emission, and the network that least squares reaches from them.
@@ -113,13 +78,11 @@ class PosedNetwork:
         settings : mapping, optional
             Its settings.
         """
-        report = self._convex.solve(solver.upper(), settings, warm=False)
-        solved = self._convex.has_solution(report)
-        duals, values, value = self._convex.results(solved=solved)
+        found = self._convex.solution(solver, settings)
+        solved = self._convex.has_solution(found.backend)
         emission = np.asarray(self.emission.value) if solved else np.full(self._network.pulses, np.nan)
         estimate, cost = self._refined(emission) if solved else (None, np.nan)
-        bound = self._convex.bound() if solved else np.nan
-        return RelaxedNetwork(emission, estimate, cost, value, bound, duals, values, report)
+        return RelaxedNetwork(**found.by_name(), emission=emission, estimate=estimate, cost=cost)
 
     def _refined(self, emission: Array) -> tuple[NetworkEstimate | None, float]:
         """Return the cheapest minimum of the likelihood from times of emission (N,), and its cost."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from optloc.cli import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose, WaveSpeed
+from optloc.cli import Budget, Force, Json, Outside, ProblemPath, Quiet, TurnAround, TwoWay, Verbose, WaveSpeed
 
 if TYPE_CHECKING:
     from optloc.sites.calibration import Calibration
@@ -35,6 +35,8 @@ def calibrate(
     out: Out = None,
     plot: Picture = None,
     wave_speed: WaveSpeed = None,
+    two_way: TwoWay = False,
+    turn_around: TurnAround = None,
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -47,7 +49,11 @@ def calibrate(
     FILE lists the stations, with coordinates only where these are known, and the measurements of each pulse.
     """
     outputs = (out, plot)
-    raise typer.Exit(_run(file, gauge, seed, outputs, wave_speed, robust=robust, as_json=as_json, quiet=quiet))
+    raise typer.Exit(
+        _run(
+            file, gauge, seed, outputs, (wave_speed, two_way, turn_around), robust=robust, as_json=as_json, quiet=quiet
+        )
+    )
 
 
 def _run(
@@ -55,7 +61,7 @@ def _run(
     gauge: str | None,
     seed: int,
     outputs: tuple[Path | None, Path | None],
-    wave_speed: str | None,
+    wave: tuple[str | None, bool, str | None],
     *,
     robust: bool,
     as_json: bool,
@@ -64,7 +70,8 @@ def _run(
     """Calibrate, write the outputs and return the exit code: 0 for status ok, otherwise 1.
 
     `gauge` are names of stations, separated by commas. `outputs` are the problem file and the picture to write.
-    `wave_speed` replaces the wave speed of the file.
+    `wave` has the wave speed, whether ranges are two-way times, and their turn-around time; they replace the keys of
+    the file.
     """
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
@@ -75,7 +82,7 @@ def _run(
     claim_outputs(out, picture=plot, inputs=[file])
     if out is not None:
         check_name(out)
-    network, warnings = load_network(file, wave_speed)
+    network, warnings = load_network(file, wave[0], two_way=wave[1], turn_around=wave[2])
     if not quiet and not as_json:
         for sentence in warnings:
             say(Screen(), f"Warning: {sentence}.")

@@ -9,48 +9,39 @@ from typing import Any
 import numpy as np
 
 from formulations.placement import semidefinite_problem, value
-from optloc.problem import Array, InvalidProblem
+from optloc.problem import InvalidProblem, PosedSolution
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
-from optloc.solvers import ConvexProgram
+from optloc.solvers import ConvexProgram, PosedProblem
 
 
-@dataclass(frozen=True, slots=True)
-class RelaxedPlacement:
-    """The solution of a posed placement.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelaxedPlacement(PosedSolution):
+    """The solution of a posed placement; duals, values and report are as in `optloc.problem.PosedSolution`.
 
     Parameters
     ----------
-    weights : mapping of str to float
-        Weight of each site, 0 to 1; NaN without a solution.
     value : float
         Objective at the weights: the criterion unless the objective is your own. It is the natural logarithm of the
         squared volume for "volume", else m^2.
     bound : float
         Lower bound of the objective for all sets that meet the rules, recomputed from a dual point; NaN without one.
+    weights : mapping of str to float
+        Weight of each site, 0 to 1; NaN without a solution.
     criterion : float
         The criterion at the weights, computed without the solver.
-    duals, values : mapping of str to float or array
-        Multiplier, and left side minus right side, of each named constraint.
-    backend : formulations.solver_report.SolverReport
-        Report of the back end.
     """
 
     weights: Mapping[str, float]
-    value: float
-    bound: float
     criterion: float
-    duals: Mapping[str, float | Array]
-    values: Mapping[str, float | Array]
-    backend: Any
 
 
-class PosedPlacement:
-    """The relaxation of a choice of sites; see `pose_placement`.
+class PosedPlacement(PosedProblem):
+    """The relaxation of a choice of sites, with relations such as ``posed.site("A") + posed.site("B") <= 1``.
+
+    See `pose_placement`.
 
     Attributes
     ----------
-    problem : cvxpy.Problem
-        The relaxation, with the criterion as objective.
     weights : cvxpy.Variable, shape (n,)
         Weights of the sites in the order of `names`.
     names : tuple of n str
@@ -66,55 +57,19 @@ class PosedPlacement:
         kept, out = (np.eye(len(candidates.state))[candidates.state == state] for state in (1, 0))
         rules = np.concatenate([candidates.rules, -kept, out])
         limits = np.concatenate([candidates.limits, np.full(len(kept), -1.0), np.zeros(len(out))])
-        program, self._each = semidefinite_problem(
+        program, self.per_place = semidefinite_problem(
             candidates.design, rules, limits, self._letter, worst=selection.worst
         )
         self.names: tuple[str, ...] = tuple(candidates.names)
-        self._convex = ConvexProgram(program)
         self.weights = next(one for one in program.variables() if one.name() == "weights")
-
-    @property
-    def problem(self) -> Any:
-        """Return the relaxation as a cvxpy problem."""
-        return self._convex.problem
-
-    @property
-    def per_place(self) -> Any:
-        """Return the criterion at each place as an expression (P,)."""
-        return self._each
+        self._convex = ConvexProgram(program, example="posed.weights[0] <= 0.5", instead="use a convex expression")
+        super().__init__(self._convex)
 
     def site(self, name: str) -> Any:
         """Return the weight of a named site as an expression; raise InvalidProblem for an unknown name."""
         if name not in self.names:
             raise InvalidProblem(f"there is no site {name!r}", "site", f"the sites are {', '.join(self.names)}")
         return self.weights[self.names.index(name)]
-
-    def add(self, constraint: Any, *, name: str | None = None) -> None:
-        """Add a relation of cvxpy between weights, or between criteria of places.
-
-        Parameters
-        ----------
-        constraint : cvxpy relation
-            For instance ``posed.site("A") + posed.site("B") <= 1``.
-        name : str, optional
-            Name for duals and messages.
-
-        Raises
-        ------
-        InvalidProblem
-            If it is not a convex relation of this problem, or if its name is in use.
-        """
-        label = name or f"constraint {1 + len(self._convex.relations)}"
-        if label in self._convex.relations:
-            raise InvalidProblem(
-                f"there is already a constraint {label!r}", "name", "give each constraint its own name"
-            )
-        self._convex.relations[label] = self._convex.relation(constraint, label)
-        self._convex.restate()
-
-    def minimise(self, expression: Any) -> None:
-        """Replace the criterion by a convex expression of your own; raise InvalidProblem for any other expression."""
-        self._convex.minimise(expression)
 
     def solve(self, solver: str = "CLARABEL", settings: Mapping[str, Any] | None = None) -> RelaxedPlacement:
         """Return the weights of least value, with a bound for all sets of sites, duals and the report of the back end.
@@ -126,15 +81,12 @@ class PosedPlacement:
         settings : mapping, optional
             Its settings.
         """
-        report = self._convex.solve(solver.upper(), settings, warm=False)
-        solved = self._convex.has_solution(report)
-        duals, values, cost = self._convex.results(solved=solved)
+        found = self._convex.solution(solver, settings)
+        solved, own = self._convex.has_solution(found.backend), self._candidates
         w = np.asarray(self.weights.value) if solved else np.full(len(self.names), np.nan)
-        own = self._candidates
         criterion = float(value(own.design, w, self._letter, worst=own.selection.worst)) if solved else np.nan
-        bound = self._convex.bound() if solved else np.nan
         weights = dict(zip(self.names, w.tolist(), strict=True))
-        return RelaxedPlacement(weights, cost, bound, criterion, duals, values, report)
+        return RelaxedPlacement(**found.by_name(), weights=weights, criterion=criterion)
 
 
 def pose_placement(selection: SiteSelection) -> PosedPlacement:

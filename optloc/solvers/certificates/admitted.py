@@ -57,6 +57,7 @@ from optloc.solvers.certificates.branch_and_bound import (
     state_claims,
     unknown_claim,
 )
+from optloc.solvers.certificates.moving_medium import certified_at_rest, problem_at_rest
 from optloc.solvers.certificates.out_of_reach import edges_of, out_of_reach
 from optloc.solvers.certificates.position_cost import (
     Costs,
@@ -93,6 +94,9 @@ def certified(
     `region` (2, d) has the corners of the requested box, metres, as of `certify`. `margin` is the gap of cost to prove
     to other minima. `effort` multiplies the number of boxes that a proof may use.
     """
+    still = problem_at_rest(problem)
+    if still is not None and pool is not None and not pool.loss:
+        return certified_at_rest(problem, pool, still, certified, region, margin, effort)
     limited = any(not is_exact(constraint) for constraint in problem.constraints)
     if pool is None or region is not None or not limited or why_unsupported(problem) or problem.motions[0].order:
         return certified_freely(problem, pool, region, margin, effort)

@@ -77,6 +77,8 @@ def _single(problem: Problem) -> Problem:
 
 def _named(problem: Problem, text: str) -> str:
     """Return the full name of a formulation; raise InvalidProblem for an unknown or ambiguous one."""
+    if not isinstance(text, str):
+        raise InvalidProblem(f"{text!r} is not the name of a formulation", "formulation", "give a text such as 'nls'")
     if text in FORMULATIONS:
         return text
     entries = {name: FORMULATIONS[name] for name in FORMULATIONS}

@@ -107,7 +107,7 @@ def _of_band(problem: Problem, band: Band) -> list[ConvexSet]:
         normal, lower, upper = normal / length, lower / length, upper / length
         if lower == upper:
             return [HalfSpace(normal, upper, equal=True)]
-        sides = [(1.0, upper), (-1.0, -lower)]
+        sides = [(-1.0, -lower), (1.0, upper)]
         return [HalfSpace(sign * normal, offset) for sign, offset in sides if np.isfinite(offset)]
     if band.kind == "distance" and not lower > 0.0:
         return [ConvexBall(np.ravel(band.coefficients).astype(float), upper)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -11,7 +11,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.solvers.posing.convex_statement import Relation
+from optloc.problem.posed_answer import PosedSolution
+from optloc.solvers.posing.posed_problem import EXAMPLE, Relation, joined
 
 # Seed of the point at which gradients set the unit of a relation; arbitrary, so that the same relation has one unit.
 _SEED = 20261130
@@ -20,10 +21,12 @@ _SEED = 20261130
 _SMALLER = (1e-3, 1e-6)
 # Largest violation of a rule, in its unit of order one, at which a further attempt found a point.
 _MET = 1e-5
-# If Clarabel stops early with a larger residual than this, its factorisation may have lost its digits. The settings are
-# for a second attempt, as in `formulations.conic`.
-_FINE = 1e-7
-_REGULAR = {"static_regularization_constant": 1e-7}
+# If Clarabel stops early with a larger residual than a limit, its factorisation may have lost its digits. The settings
+# are for further attempts: the first as in `formulations.conic`, the second with shorter steps and refined directions.
+_AGAIN: tuple[tuple[float, dict[str, float]], ...] = (
+    (1e-7, {"static_regularization_constant": 1e-7}),
+    (1e-6, {"max_step_fraction": 0.8, "iterative_refinement_max_iter": 50, "iterative_refinement_stop_ratio": 1.5}),
+)
 
 
 class ConvexProgram:
@@ -37,6 +40,10 @@ class ConvexProgram:
         The cost is ``size`` times the objective, plus ``constant``.
     settings : mapping of str to float
         Settings of Clarabel for the program without changes of its objective.
+    example : str
+        A relation between expressions of the program, for messages.
+    instead : str
+        Advice about relations and objectives that are not convex.
 
     Attributes
     ----------
@@ -45,12 +52,21 @@ class ConvexProgram:
     """
 
     def __init__(
-        self, program: Any, size: float = 1.0, constant: float = 0.0, settings: Mapping[str, float] | None = None
+        self,
+        program: Any,
+        size: float = 1.0,
+        constant: float = 0.0,
+        settings: Mapping[str, float] | None = None,
+        *,
+        example: str = EXAMPLE,
+        instead: str = "use the formulation 'nls'",
     ) -> None:
         self.base, self.size, self.constant = program, size, constant
         self.settings: dict[str, float] = dict(settings or {})
         self.goal = program.objective.args[0]
         self.relations: dict[str, Relation] = {}
+        self.own_objective = False
+        self._example, self._instead = example, instead
         # duals are of the goal times this factor
         self._factor = 1.0
         self.restate()
@@ -74,19 +90,18 @@ class ConvexProgram:
         self.check_unknowns(expression, "objective")
         if not (expression.is_convex() and expression.is_dcp()):
             raise InvalidProblem(
-                "the objective is not convex by cvxpy's rules",
-                "objective",
-                "use the formulation 'nls' or a convex atom",
+                "the objective is not convex by cvxpy's rules", "objective", f"{self._instead} or a convex atom"
             )
         size = float(self.units(expression)[0])
         self.goal, self.size, self.constant = cp.sum(expression) / size, size, 0.0
+        self.settings, self.own_objective = {}, True
         self.restate()
 
     def check_unknowns(self, expression: Any, where: str) -> None:
         """Raise InvalidProblem if an expression contains no variable of the program."""
         own = {one.id for one in self.base.variables()}
         if not own & {one.id for one in expression.variables()}:
-            raise InvalidProblem("it has no unknown of this problem", where, "use posed.position or posed.of(name)")
+            raise InvalidProblem("it has no unknown of this problem", where, f"use expressions as in {self._example}")
 
     def relation(self, constraint: Any, name: str) -> Relation:
         """Return a relation of cvxpy, divided by its own unit."""
@@ -97,13 +112,11 @@ class ConvexProgram:
             raise InvalidProblem(
                 f"{type(constraint).__name__} is no relation of cvxpy and no constraint of optloc.constraints",
                 "constraint",
-                "write a relation such as posed.position[0] <= 100",
+                f"write a relation such as {self._example}",
             )
         self.check_unknowns(constraint, "constraint")
         if not constraint.is_dcp():
-            raise InvalidProblem(
-                f"the constraint {name!r} is not convex by cvxpy's rules", "constraint", "use the formulation 'nls'"
-            )
+            raise InvalidProblem(f"the constraint {name!r} is not convex by cvxpy's rules", "constraint", self._instead)
         if isinstance(constraint, kinds.SOC | kinds.PSD):
             unit = np.asarray(np.max(np.concatenate([self.units(one) for one in constraint.args])))
             return Relation(name, (type(constraint)(*(one / float(unit) for one in constraint.args)),), (unit,), True)
@@ -192,11 +205,8 @@ class ConvexProgram:
                 one.value = one.project(value)
         try:
             report = solve_problem(self.program, solver, own, warm=warm)
-            if solver == "CLARABEL" and report.outcome in ("failed", "inaccurate") and not report.worst <= _FINE:
-                again = solve_problem(self.program, solver, {**_REGULAR, **own})
-                # the variables keep the values of the last solve
-                better = again.worst <= report.worst or not np.isfinite(report.worst)
-                report = again if better else solve_problem(self.program, solver, own)
+            if solver == "CLARABEL":
+                report = self._solve_again(report, own)
             if solver == "CLARABEL" and self.relations and report.outcome in ("failed", "infeasible"):
                 report = self._solve_smaller(report, own)
         except ValueError as trouble:
@@ -211,6 +221,21 @@ class ConvexProgram:
             text = f"{solver} does not use start and duals, because it is an interior-point or simplex method"
             report = replace(report, message="; ".join(filter(None, [report.message, text])))
         return report
+
+    def _solve_again(self, report: Any, settings: Mapping[str, Any]) -> Any:
+        """Return the best report of Clarabel with further settings, or `report` if its residuals are small."""
+        from formulations.conic_solvers import solve_problem
+
+        best, used, last = report, settings, settings
+        for limit, more in _AGAIN:
+            if best.outcome not in ("failed", "inaccurate") or best.worst <= limit:
+                break
+            last = {**more, **settings}
+            again = solve_problem(self.program, "CLARABEL", last)
+            if again.worst <= best.worst or not np.isfinite(best.worst):
+                best, used = again, last
+        # the variables keep the values of the last solve
+        return best if used is last else solve_problem(self.program, "CLARABEL", used)
 
     def _is_caused_by_settings(self, solver: str) -> bool:
         """Return whether a solver that raised an error raises none without the settings of the user."""
@@ -252,6 +277,15 @@ class ConvexProgram:
         free = any(one.free for one in self.relations.values())
         rules = self.program.constraints if free else [part for one in self.relations.values() for part in one.parts]
         return all(np.max(one.violation(), initial=0.0) <= _MET for one in rules)
+
+    def solution(
+        self, solver: str | None, settings: Mapping[str, Any] | None, *, warm: bool = False, start: Any = None
+    ) -> PosedSolution:
+        """Return duals, values, objective and bound of a solve; arguments as of `solve`, by default with Clarabel."""
+        report = self.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=start)
+        solved = self.has_solution(report)
+        duals, values, value = self.results(solved=solved)
+        return PosedSolution(duals, values, report, value, self.bound() if solved else np.nan)
 
     def has_solution(self, report: Any) -> bool:
         """Return whether a report is of a solution, and all variables have finite values."""
@@ -310,11 +344,3 @@ def _value(part: Any) -> Array:
     if hasattr(part, "expr"):
         return np.asarray(part.expr.value, dtype=float)
     return np.asarray(part.args[0].value, dtype=float)
-
-
-def joined(values: Sequence[Array]) -> float | Array:
-    """Return a single number as float, and several numbers as one vector or in their own shape."""
-    if len(values) == 1:
-        one = np.asarray(values[0])
-        return float(one.ravel()[0]) if one.size == 1 else one
-    return np.concatenate([np.ravel(one) for one in values])

@@ -14,28 +14,6 @@ Locate = Callable[[Problem], Fix]
 """Maps a problem to its fix by the method "auto", for formulations that are posed around a fix."""
 
 
-@dataclass(frozen=True, slots=True)
-class Relation:
-    """A named constraint of a posed problem, one entry for each scalar relation ``left - right <= 0`` or ``== 0``.
-
-    Parameters
-    ----------
-    name : str
-        Name for duals and messages.
-    parts : tuple
-        Relations in the language of the back end, normalised.
-    divisor : tuple of array
-        For each part, the numbers in SI units by which it is divided.
-    free : bool
-        Whether it holds in the posed problem only; else it is a constraint of the `Problem` too.
-    """
-
-    name: str
-    parts: tuple[Any, ...]
-    divisor: tuple[Array, ...]
-    free: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConicStatement:
     """A convex formulation of one problem.
@@ -62,8 +40,12 @@ class ConicStatement:
         Returns the distance of the solution from a point; near zero means exact.
     within : str
         Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
+    at_height : bool
+        Whether the formulation itself keeps the exact height of the problem.
+    nowhere : str
+        The sentence for a program without any point, before changes.
     settings : mapping of str to float
-        Settings of Clarabel with which the method of the same name solves.
+        Settings of Clarabel.
     """
 
     program: Any
@@ -77,6 +59,8 @@ class ConicStatement:
     residual: Any = None
     missing: Mapping[str, str] = field(default_factory=dict)
     within: str = ""
+    at_height: bool = False
+    nowhere: str = "no point meets the posed problem"
     settings: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -19,6 +19,9 @@ from optloc.solvers.starts.registration import place_states, run_of, run_starts,
 from optloc.solvers.starts.registration_windows import has_windows, windows_of
 
 _REACH = 10.0  # greatest distance of a source without a known height, as in `formulations.doppler_sdp.doppler`
+# Settings of Clarabel for the duals of runs. The method needs a start only, and keeps the default of 1e-8. With steps
+# of 0.99 iterates are so near the boundary of the cones that the value has six digits.
+_FINE = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-9, "max_step_fraction": 0.8}
 
 
 def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
@@ -27,7 +30,6 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
     The parameter "price" multiplies the mean squared distance from the array's centre, which is part of the objective.
     `locate` is not used.
     """
-    from formulations.conic import tight
     from formulations.registration_sdp import (
         RegistrationWindows,
         largest_rank_ratio,
@@ -49,7 +51,8 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
         *(given[name] for name in ("station", "z", "whiten", "sigma", "design", "mean", "time"))
     )
     (K, S, d), order, b = data.station.shape, data.power.shape[1] - 1, len(data.prior)
-    program = registration_problem(K, S, d, order, b)
+    change = _less_biases(data)
+    program = registration_problem(K, S, d, order, b, change)
     set_parameters(program, {**data.parameters(), "price": answers[0].price * data.weight})
     every = {one.name(): one for one in program.variables()}
     shared, n = every["shared"], d * (order + 1)
@@ -71,11 +74,24 @@ def pose_registration(problem: Problem, locate: Locate) -> ConicStatement:
         origin=run.origin + run.length * data.origin,
         unit=run.length * data.scale,
         parts=parts,
-        residual=_window_residuals(data, every, n),
+        residual=_window_residuals(data, every, change[-1, -1]),
         read=read,
         rank_ratio=lambda: largest_rank_ratio({name: one.value for name, one in every.items()}, K),
-        settings=tight("CLARABEL", 1e-9),  # for duals; the method needs a start only, and keeps the default of 1e-8
+        settings=_FINE,
     )
+
+
+def _less_biases(data: Any) -> Array:
+    """Return the matrix (S, b + S) from biases, first range and remainders less their biases to range and remainders.
+
+    The new remainders are in deviations of the noise. With the old remainders the cost would be a small difference of
+    large numbers.
+    """
+    rows, b = data.design.shape
+    fine = 1.0 / np.sqrt(np.einsum("kii->ki", data.gram).mean())
+    change = np.zeros((1 + rows, b + 1 + rows))
+    change[0, b], change[1:, :b], change[1:, b + 1 :] = 1.0, data.design, fine * np.eye(rows)
+    return change
 
 
 def _course(data: Any, target: Any, d: int, order: int) -> tuple[Any, Any]:
@@ -87,15 +103,14 @@ def _course(data: Any, target: Any, d: int, order: int) -> tuple[Any, Any]:
     return data.origin + place, speed
 
 
-def _window_residuals(data: Any, every: Mapping[str, Any], n: int) -> Any:
-    """Return the whitened remainders of all windows less their biases, (K (S - 1),)."""
+def _window_residuals(data: Any, every: Mapping[str, Any], fine: float) -> Any:
+    """Return the whitened remainders of all windows less their biases, (K (S - 1),); `fine` is the unit of these."""
     import cvxpy as cp
 
-    delta = every["shared"][0, 1 + n :]
     parts = []
     for k, gram in enumerate(data.gram):
         root = np.linalg.cholesky(gram).T
-        parts.append(root @ (every[f"across {k}"][0, 1:] - data.design @ delta))
+        parts.append(fine * root @ every[f"across {k}"][0, 1:])
     return cp.hstack(parts)
 
 
@@ -156,6 +171,7 @@ def pose_doppler(problem: Problem, locate: Locate) -> ConicStatement:
         unit=scene.length,
         parts={"position": position, **_by_slot(problem.layout, rows.column, scene.unknown(lift))},
         residual=(scene.whiten @ (scene.rows / far[:, None])) @ lift[0],
+        at_height=surface is not None,
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
         settings=settings_of(),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import AnyOf, Array, Band, Constraint, Polygon, Status
+from optloc.base.types import AnyOf, Array, Band, Constraint, Fence, Polygon, Status
 from optloc.linear.constraints import is_conjunctive
 from optloc.problem.constraint_checks import check_constraints
 from optloc.problem.fix import Fix
@@ -18,7 +18,7 @@ from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import Method
 from optloc.solvers.pool import begin, in_parts, noting_place, pack
-from optloc.solvers.posing.convex_statement import Relation
+from optloc.solvers.posing.posed_problem import EXAMPLE, PosedProblem, Relation, StatedProgram
 from optloc.solvers.solution import with_sources
 from optloc.solvers.verdict.judge import failed_fixes, hide_open_epochs, verdict
 
@@ -28,7 +28,19 @@ _REFINEMENT = Method(("lsr", "certify"))
 _CONSTRAINED = "auto"
 
 
-class Posed(ABC):
+@dataclass(frozen=True, slots=True)
+class SolveRequest:
+    """The arguments of `Posed.solve`; `warm` is its argument `warm_start` or the default of this argument."""
+
+    solver: str | None
+    settings: Mapping[str, Any]
+    start: Any
+    duals: Mapping[str, float | Array] | None
+    warm: bool
+    refine: bool | None
+
+
+class Posed(PosedProblem, ABC):
     """An optimisation problem that a formulation poses, to read, to change and to solve.
 
     Parameters
@@ -37,24 +49,19 @@ class Posed(ABC):
         Flat batch of one problem.
     formulation : str
         Name of the formulation.
-
-    Attributes
-    ----------
-    problem
-        The optimisation problem: a ``cvxpy.Problem`` whose parameters have values, or for a nonlinear program a
-        dictionary of ``casadi.SX`` with the keys x, f, g and p.
+    program : StatedProgram
+        Its optimisation problem, without the constraints of `stated`.
     origin, unit
         Scaled coordinates are ``(x - origin) / unit``, metres.
     """
 
-    problem: Any
-    origin: Array
-    unit: float
-
-    def __init__(self, stated: Problem, formulation: str) -> None:
-        self.stated, self.formulation = stated, formulation
-        self.relations: dict[str, Relation] = {}
-        self.own_objective = False
+    def __init__(self, stated: Problem, formulation: str, program: StatedProgram, origin: Array, unit: float) -> None:
+        super().__init__(program)
+        self.stated, self.formulation, self.origin, self.unit = stated, formulation, origin, unit
+        # the alternatives of each union, one of which is among the relations
+        self._unions: dict[str, list[Relation]] = {}
+        # names of constraints and fences of the problem that the posed problem lacks; only the refinement obeys them
+        self.dropped: list[str] = []
 
     def __repr__(self) -> str:
         """Return the name of the formulation, and the changes, as text."""
@@ -145,16 +152,28 @@ class Posed(ABC):
         if members is not None:
             self._add_table(members, name)
             return
+        if isinstance(constraint, Fence) or (
+            isinstance(constraint, tuple | list) and any(isinstance(one, Fence) for one in constraint)
+        ):
+            raise InvalidProblem(
+                "a fence is a term of the cost and no constraint",
+                "constraint",
+                "give it to optloc.assemble, and pose that problem by 'nls'",
+            )
         if isinstance(constraint, bool | np.bool_):
             raise InvalidProblem(
-                "the relation has no unknown of this problem", "constraint", "use posed.position or posed.of(name)"
+                "the relation has no unknown of this problem", "constraint", f"use expressions as in {EXAMPLE}"
             )
         free = self._new_name(name)
-        planes = self._as_planes(constraint, free)
+        planes, lengths = self._as_planes(constraint, free)
         if planes:
             self._add_table(planes, free)
+            stored = self.relations[free]
+            if len(stored.divisor) == len(lengths):  # duals and values are of the relation as it is written
+                units = tuple(d * size for d, size in zip(stored.divisor, lengths, strict=True))
+                self._program.relations[free] = replace(stored, divisor=units)
         else:
-            self._put(self._relation(constraint, free))
+            self._put(self._program.relation(constraint, free))
 
     def _add_table(self, members: Sequence[Any], name: str | None) -> None:
         """Add constraints of the table to the `Problem` and to the posed problem; all get `name` if it is given."""
@@ -169,40 +188,35 @@ class Posed(ABC):
         check_constraints(stated)
         found: dict[str, list[Relation]] = {}
         for label, one in named:
-            found.setdefault(label, []).append(self._table_relation(one, label))
+            found[label] = _together(found.get(label), self._table_relations(one, label))
         self.stated = stated
-        for label, several in found.items():
-            parts = tuple(part for one in several for part in one.parts)
-            self._put(Relation(label, parts, tuple(d for one in several for d in one.divisor), free=False))
+        for alternatives in found.values():
+            self._put_one_of(alternatives)
 
-    def _new_name(self, name: str | None) -> str:
-        """Return a name for a constraint; raise InvalidProblem if it is in use."""
-        if name is None:
-            name = next(
-                text for i in range(1, 2 + len(self.relations)) if (text := f"constraint {i}") not in self.relations
-            )
-        if not isinstance(name, str):
-            raise InvalidProblem(f"the name {name!r} is no text", "name", "give a text such as 'fence'")
-        if name in self.relations:
-            raise InvalidProblem(f"there is already a constraint {name!r}", "name", "give each constraint its own name")
-        return name
+    def _take_over(self) -> None:
+        """Add the constraints of the problem; a constraint that the back end cannot state stays with the refinement."""
+        for one in self.stated.constraints:
+            before = self.relations.get(one.name)
+            alone = before is not None and (one.name in self._unions or not is_conjunctive(one))
+            label = self._counted(one.name, 2) if alone else one.name
+            try:
+                alternatives = self._table_relations(one, label)
+            except InvalidProblem:
+                if not self._keeps(one):
+                    self.dropped.append(one.name)
+                continue
+            self._put_one_of(alternatives if before is None or alone else _together([before], alternatives))
 
-    def _put(self, relation: Relation) -> None:
-        """Store a relation and state the problem with it."""
-        self.relations[relation.name] = relation
-        self._restate()
+    def _keeps(self, constraint: Constraint) -> bool:
+        """Return whether the formulation itself keeps a constraint of the problem that its back end cannot state."""
+        return False
 
-    @abstractmethod
-    def minimise(self, expression: Any) -> None:
-        """Replace the objective by an expression of your own, in your unit.
+    def _put_one_of(self, alternatives: Sequence[Relation]) -> None:
+        """State the problem with the first of the alternatives of a constraint, and keep the others for the solve."""
+        if len(alternatives) > 1:
+            self._unions[alternatives[0].name] = list(alternatives)
+        self._put(alternatives[0])
 
-        Raises
-        ------
-        InvalidProblem
-            If it is not a scalar, has no unknown of this problem, or is not convex in a convex formulation.
-        """
-
-    @abstractmethod
     def solve(
         self,
         solver: str | None = None,
@@ -239,22 +253,35 @@ class Posed(ABC):
             With constraints that hold for the fix too, the solution and the starts of `optloc.solve` compete in the
             refinement. If the back end finds no solution then, the reason says so, and the starts alone are refined.
         """
+        warm = (start is not None or duals is not None) if warm_start is None else warm_start
+        if not (solver is None or isinstance(solver, str)):
+            raise InvalidProblem(f"{solver!r} is not the name of a solver", "solver", "see 'optloc list solvers'")
+        if not (settings is None or isinstance(settings, Mapping)):
+            raise InvalidProblem(
+                f"{settings!r} is no dictionary", "settings", "give a dictionary, such as {'max_iter': 50}"
+            )
+        return self._solve(SolveRequest(solver, settings or {}, start, duals, warm, refine))
 
     @abstractmethod
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _solve(self, request: SolveRequest) -> Fix:
+        """Return the judged fix; see `solve`."""
 
     @abstractmethod
-    def _relation(self, constraint: Any, name: str) -> Relation:
-        """Return a relation of the back end's language, divided by its own unit."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals.
+
+        Both are empty for any other relation.
+        """
 
     @abstractmethod
-    def _table_relation(self, constraint: Any, name: str) -> Relation:
-        """Return a constraint of the table in the back end's language."""
+    def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
+        """Return a constraint of the table in the back end's language: alternatives, one of which holds.
 
-    @abstractmethod
-    def _restate(self) -> None:
-        """Rewrite `problem` after a change."""
+        Raises
+        ------
+        InvalidProblem
+            If the back end cannot state it.
+        """
 
     # The fix.
 
@@ -270,13 +297,14 @@ class Posed(ABC):
             return self._failed(Status.NUMERICAL, "the solution of the posed problem gives no position", answer)
         if not wanted:
             fix = _of_pool(self.stated, starts[:1], None)
-            reason = f"the optimum of the posed problem{self._changes()}, not refined"
+            lost = f", without {_constraints(self.dropped)}" if self.dropped else ""
+            reason = f"the optimum of the posed problem{self._changes()}{lost}, not refined"
             return _marked(fix, Status.UNREFINED, reason, replace(answer, refined=False))
         fix = _of_pool(self.stated, pack(starts[None])[0], self._refinement)
         answer = replace(answer, refined=True)
         if not (self.free or self.own_objective):
             return replace(fix, posed=answer)
-        without = [f"the constraint{'s' if len(self.free) > 1 else ''} {_quoted(self.free)}"] if self.free else []
+        without = [f"the {_constraints(self.free)}"] if self.free else []
         without += ["your objective"] if self.own_objective else []
         reason = f"refined without {' and '.join(without)}"
         if not bool(fix.answered):
@@ -298,17 +326,22 @@ class Posed(ABC):
             fix = _of_pool(self.stated, np.full((1, self.stated.layout.size), np.nan), self._refinement)
             # a contradiction or a run to infinity is an answer of `optloc.solve` too
             if int(fix.code) not in (Status.NUMERICAL, int(code)):
-                text = f"the posed problem has no solution by {answer.backend}; the starts are of the method 'auto'"
+                failed = code == Status.NUMERICAL
+                why = f"the posed problem has no solution by {answer.backend}" if failed else reason
+                text = f"{why}; the starts are of the method 'auto'"
                 return replace(fix, reason=_joined(fix.reason, text), posed=replace(answer, refined=False))
         return self._failed(code, reason, answer)
 
     def _changes(self) -> str:
         """Return the changes of the posed problem as the end of a sentence."""
-        what = (
-            [f"constraint{'s' if len(self.relations) > 1 else ''} {_quoted(self.relations)}"] if self.relations else []
-        )
+        what = [_constraints(self.relations)] if self.relations else []
         what += ["your objective"] if self.own_objective else []
         return f" with {' and '.join(what)}" if what else ""
+
+    def _unbounded(self, answer: PosedAnswer) -> Fix:
+        """Return the fix of an objective without a least value."""
+        what = "your objective" if self.own_objective else "the objective"
+        return self._failed(Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer)
 
     def _failed(self, code: Status, reason: str, answer: PosedAnswer) -> Fix:
         """Return a fix without an answer."""
@@ -346,9 +379,21 @@ def _table_members(constraint: Any) -> list[Constraint] | None:
     return None
 
 
-def _quoted(names: Iterable[str]) -> str:
-    """Return names in quotation marks, joined by "and"."""
-    return " and ".join(f'"{name}"' for name in names)
+def _together(before: Sequence[Relation] | None, more: list[Relation]) -> list[Relation]:
+    """Return the alternatives `more` of a constraint, after a constraint of the same name, as one constraint.
+
+    Both constraints have one alternative each if there is a constraint before.
+    """
+    if before is None:
+        return more
+    (first,), (second,) = before, more
+    return [replace(first, parts=(*first.parts, *second.parts), divisor=(*first.divisor, *second.divisor))]
+
+
+def _constraints(names: Collection[str]) -> str:
+    """Return the word "constraint" or "constraints", and the names in quotation marks, joined by "and"."""
+    quoted = " and ".join(f'"{name}"' for name in names)
+    return f"constraint{'s' if len(names) > 1 else ''} {quoted}"
 
 
 def _joined(reason: Any, more: str) -> Array:

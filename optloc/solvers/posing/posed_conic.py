@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Band, Status
+from optloc.base.types import Array, Band, Constraint, Status
+from optloc.linear.constraints import is_exact
 from optloc.problem.fix import Fix
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
-from optloc.solvers.posing.convex_statement import ConicStatement, Relation
-from optloc.solvers.posing.posed import Posed, numbers_of_start
+from optloc.solvers.posing.convex_statement import ConicStatement
+from optloc.solvers.posing.posed import Posed, SolveRequest, numbers_of_start
+from optloc.solvers.posing.posed_problem import Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
 _ALONE = 1e-9
+# Difference of value and bound, relative to the value, from which an objective of the user counts as unbounded.
+# Clarabel reports solutions of unbounded problems at 1e8 m, whose bounds are 1e8 times lower; bounds of other solutions
+# agree to 1e-6.
+_SLACK = 1e-2
 
 
 class PosedConic(Posed):
@@ -27,35 +32,22 @@ class PosedConic(Posed):
 
     Parameters
     ----------
-    stated : Problem
-        Flat batch of one problem.
-    formulation : str
-        Name of the formulation.
+    stated, formulation
+        As in `Posed`.
     statement : ConicStatement
         The convex problem.
     """
 
     def __init__(self, stated: Problem, formulation: str, statement: ConicStatement) -> None:
-        super().__init__(stated, formulation)
-        self.statement, self.origin, self.unit = statement, statement.origin, statement.unit
+        self.statement = statement
         self._convex = ConvexProgram(statement.program, statement.size, statement.constant, statement.settings)
-        self.relations = self._convex.relations
-        self._restate()
-        for constraint in stated.constraints:
-            self._take_over(constraint)
+        super().__init__(stated, formulation, self._convex, statement.origin, statement.unit)
+        self.dropped += [fence.name for fence in stated.fences]
+        self._take_over()
 
-    def _take_over(self, constraint: Any) -> None:
-        """Add a constraint of the problem to the relaxation; one that is not convex stays with the refinement."""
-        try:
-            relation = self._table_relation(constraint, constraint.name)
-        except InvalidProblem:
-            return
-        before = self.relations.get(constraint.name)
-        if before is not None:
-            relation = replace(
-                before, parts=(*before.parts, *relation.parts), divisor=(*before.divisor, *relation.divisor)
-            )
-        self._put(relation)
+    def _keeps(self, constraint: Constraint) -> bool:
+        """Return whether the formulation itself keeps a constraint of the problem: an exact height."""
+        return self.statement.at_height and getattr(constraint, "kind", "") == "height" and is_exact(constraint)
 
     # Parts.
 
@@ -84,30 +76,15 @@ class PosedConic(Posed):
 
     # Changes.
 
-    def minimise(self, expression: Any) -> None:
-        """Replace the objective by a convex expression of your own; see `Posed.minimise`."""
-        self._convex.minimise(expression)
-        self._convex.settings, self.own_objective = {}, True
-        self._restate()
-
-    def _restate(self) -> None:
-        """Rewrite `problem` after a change."""
-        self._convex.restate()
-        self.problem = self._convex.problem
-
-    def _relation(self, constraint: Any, name: str) -> Relation:
-        """Return a relation of cvxpy, divided by its own unit."""
-        return self._convex.relation(constraint, name)
-
-    def _as_planes(self, constraint: Any, name: str) -> list[Band]:
-        """Return planes that a linear relation of the position alone states; empty for any other relation."""
+    def _as_planes(self, constraint: Any, name: str) -> tuple[list[Band], list[float]]:
+        """Return planes that a linear relation of the position alone states, and the lengths of their normals."""
         import cvxpy as cp
 
         if not isinstance(constraint, cp.constraints.Inequality | cp.constraints.Equality):
-            return []
+            return [], []
         expression, position = constraint.expr, self.statement.parts.get("position")
         if position is None or not expression.is_affine() or expression.parameters():
-            return []
+            return [], []
         self._convex.check_unknowns(expression, "constraint")
         with self._convex.probe(expression, position):
             slope, place = self._convex.gradient(expression), self._convex.gradient(position)
@@ -117,19 +94,20 @@ class PosedConic(Posed):
             normal = np.linalg.lstsq(full[0].T, full[1].T, rcond=None)[0].T
             # a column of the lift and its transpose are one number, but two entries of a gradient
             if np.abs(normal @ full[0] - full[1]).max() > _ALONE * (1.0 + np.abs(full[1]).max()):
-                return []
+                return [], []
             offset = normal @ position.value - np.ravel(expression.value, order="F")
         equal = isinstance(constraint, cp.constraints.Equality)
         length = np.linalg.norm(normal, axis=1)
         if not (length > 0.0).all():
-            return []
+            return [], []
         lower = offset / length if equal else np.full(len(offset), -np.inf)
-        return [
+        planes = [
             Band("plane", np.asarray(low), np.asarray(up), direction, name)
             for low, up, direction in zip(lower, offset / length, normal / length[:, None], strict=True)
         ]
+        return planes, length.tolist()
 
-    def _table_relation(self, constraint: Any, name: str) -> Relation:
+    def _table_relations(self, constraint: Any, name: str) -> list[Relation]:
         """Return a constraint of the table as relations of cvxpy, divided by the unit of length."""
         import cvxpy as cp
 
@@ -141,58 +119,46 @@ class PosedConic(Posed):
             else:
                 away = (position[: len(one.centre)] - one.centre) / self.unit
                 parts.append(cp.norm(away) <= one.radius / self.unit)
-        return Relation(name, tuple(parts), tuple(np.array(self.unit) for _ in parts), free=False)
+        return [Relation(name, tuple(parts), tuple(np.array(self.unit) for _ in parts), free=False)]
 
     # The solution.
 
-    def solve(
-        self,
-        solver: str | None = None,
-        settings: Mapping[str, Any] | None = None,
-        *,
-        start: Any = None,
-        duals: Mapping[str, float | Array] | None = None,
-        warm_start: bool | None = None,
-        refine: bool | None = None,
-    ) -> Fix:
-        """Return the judged fix of the posed problem; see `Posed.solve`."""
-        warm = (start is not None or duals is not None) if warm_start is None else warm_start
-        earlier = getattr(start, "posed", start)
-        if not (start is None or isinstance(earlier, PosedAnswer)):
+    def _solve(self, request: SolveRequest) -> Fix:
+        """Return the judged fix; see `Posed.solve`."""
+        earlier = getattr(request.start, "posed", request.start)
+        if not (request.start is None or isinstance(earlier, PosedAnswer)):
             layout = self.stated.layout
-            numbers_of_start(start, (layout.size, layout.n_shared, self.stated.dimension))
+            numbers_of_start(request.start, (layout.size, layout.n_shared, self.stated.dimension))
         first = earlier.variables if isinstance(earlier, PosedAnswer) else None
-        report = self._convex.solve((solver or "CLARABEL").upper(), settings, warm=warm, start=first)
-        solved = self._convex.has_solution(report)
-        own_duals, values, cost = self._convex.results(solved=solved)
+        found = self._convex.solution(request.solver, request.settings, warm=request.warm, start=first)
+        solved = self._convex.has_solution(found.backend)
         answer = PosedAnswer(
-            self.formulation,
-            own_duals,
-            values,
-            report,
-            cost,
-            self._convex.bound() if solved else np.nan,
-            self.statement.rank_ratio() if solved else np.nan,
+            **found.by_name(),
+            formulation=self.formulation,
+            rank_ratio=self.statement.rank_ratio() if solved else np.nan,
             refined=False,
             variables=self._convex.variables() if solved else {},
         )
+        if solved and self.own_objective and answer.bound < answer.value - _SLACK * (1.0 + abs(answer.value)):
+            text = (
+                f"your objective may have no least value: {answer.value:.3g} is above the bound {answer.bound:.3g}; "
+                "add limits"
+            )
+            return self._failed(Status.NUMERICAL, text, answer)
         if solved:
-            return self._conclude(self.statement.read(), answer, refine)
-        return self._explain_failure(answer, refine)
+            return self._conclude(self.statement.read(), answer, request.refine)
+        return self._explain_failure(answer, request.refine)
 
     def _explain_failure(self, answer: PosedAnswer, refine: bool | None) -> Fix:
         """Return the fix after a failure and its reason, from the outcome of the back end."""
         report = answer.backend
         if report.outcome == "infeasible":
-            text = f"no point meets the posed problem{self._changes()} {self.statement.within}".rstrip()
+            text = f"{self.statement.nowhere}{self._changes()} {self.statement.within}".rstrip()
             if self.statement.within:  # there may be points outside these limits, and the sentence names them
                 return self._failed(Status.INFEASIBLE, text, answer)
             return self._without_solution(Status.INFEASIBLE, text, answer, refine)
         if report.outcome == "unbounded":
-            what = "your objective" if self.own_objective else "the objective"
-            return self._failed(
-                Status.NUMERICAL, f"{what} has no least value under these constraints: add limits", answer
-            )
+            return self._unbounded(answer)
         return self._without_solution(Status.NUMERICAL, str(report), answer, refine)
 
 

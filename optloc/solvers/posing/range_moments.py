@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
@@ -10,6 +12,7 @@ from optloc.linear.mirror import one_position
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.models import MODELS
 from optloc.models.primitives import WGS84_A
+from optloc.problem.fix import Fix
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.relaxations import enclosed_ranges
@@ -19,6 +22,12 @@ from optloc.solvers.starts.position import height_sights, spread_of
 # Positions are in the box of moments if their chi-square is at most this far above the chi-square of the fix. So a
 # constraint may move the optimum by four standard deviations. A larger box is less tight.
 _MARGIN = 16.0
+# Fraction of the step to the boundary of the cones that Clarabel takes for moments, whose equalities depend on each
+# other. At its default, 0.99, iterates are so near the boundary that duals are wrong by up to 2e-4.
+_STEP = 0.8
+# Tolerance of the gap of Clarabel for the order-1 lift. For range differences the objective may be 1e-3 of its size. At
+# the tolerance of the baseline, 1e-9, duals are wrong by up to 3e-4.
+_FINE = 1e-11
 
 
 def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
@@ -26,7 +35,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
 
     `locate` maps the problem to its fix.
     """
-    from formulations.conic import rank_ratio
+    from formulations.conic import rank_ratio, tight
     from formulations.moment_sdp import moment_problem, moment_program, moments, settings_of
 
     about = enclosed_ranges(problem, locate(problem), _MARGIN)
@@ -62,7 +71,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
         within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above the chi-square of the fix",
         read=read,
         rank_ratio=lambda: rank_ratio(y.value[place]),
-        settings=settings_of(),
+        settings={**settings_of(), **tight("CLARABEL", 1e-9, max_step_fraction=_STEP)},
     )
 
 
@@ -77,7 +86,7 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
 
     given = height_sights(problem_at_rest(problem.straightened())) if one_position(problem) else None
     data = None if given is None else height_program(**given)
-    if data is None:
+    if given is None or data is None:
         raise InvalidProblem(
             "this formulation needs three ranges with a common unknown, and a known height", "formulation", 'use "nls"'
         )
@@ -96,9 +105,11 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
     return ConicStatement(
         program=program,
         size=data.size * WGS84_A**2,
-        origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])) if given else np.zeros(3),
+        origin=np.asarray(frame.from_ecef(WGS84_A * given["near"])),
         unit=WGS84_A,
         parts={"position": shift + places @ lift[:, 0]},
+        at_height=True,
+        nowhere="no point of the known height fits the ranges exactly",
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
         settings=settings_of(),
@@ -106,10 +117,12 @@ def pose_heights(problem: Problem, locate: Locate) -> ConicStatement:
 
 
 def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
-    """Return the order-1 lift of a flat batch of one problem whose rows are sums of ranges; `locate` is not used."""
+    """Return the order-1 lift of a flat batch of one problem whose rows are sums of ranges.
+
+    `locate` maps the problem to its fix, near which the lift has its unknowns if the rows determine all ranges.
+    """
     from formulations.conic import rank_ratio
     from formulations.lifted import lifted_data, lifted_problem, settings_of
-    from formulations.squared_range_conic import in_deviations
 
     models = [MODELS[rows.kind] for rows in problem.rows]
     if not one_position(problem) or any(model.ranges is None or model.emission for model in models):
@@ -124,10 +137,10 @@ def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
     station = (place - origin) / unit
     values, _, _ = lifted_data(rows, right, station)
     count, d = station.shape
-    # ranges in standard deviations: otherwise a small cost would be below the rounding error of the squared ranges
-    change, inner = np.eye(1 + d + count), in_deviations(rows, right)
-    change[1 + d :, 1 + d :], change[1 + d :, 0] = inner[:, :-1], inner[:, -1]
-    table = np.concatenate([(rows @ inner[:, -1] - right)[:, None], rows @ inner[:, :-1]], axis=1)
+    change = _deviations_of_lift(rows, right, station, lambda: _scaled_fix(locate(problem), origin, unit))
+    table = rows @ change[1 + d :]
+    table[:, 0] -= right
+    table = np.delete(table, np.s_[1 : 1 + d], axis=1)
     size = float(np.abs(table).max()) or 1.0
     program = lifted_problem(count, d, change)
     set_parameters(program, {**values, "gram": table.T @ table / size**2})
@@ -145,8 +158,44 @@ def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
         residual=rows @ lift[0, 1 + d :] - right,
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
-        settings=settings_of(),
+        settings={**settings_of(), "tol_gap_abs": _FINE, "tol_gap_rel": _FINE},
     )
+
+
+def _deviations_of_lift(
+    rows: Array, right: Array, station: Array, fix: Callable[[], tuple[Array, Array] | None]
+) -> Array:
+    """Return the matrix from the unknowns of the lift to (1, x, r), in standard deviations where these are known.
+
+    Otherwise a small cost would be below the rounding error of the squared ranges. `rows` and `right` are whitened.
+    `station` (s, d) is in the unit of `rows`. `fix` returns position and square root of its covariance.
+
+    If the rows determine all ranges, the lift is near the fix, and position and ranges are differences from it. For
+    range differences the point of the lift is far from the fix, and the position keeps its unit.
+    """
+    from formulations.squared_range_conic import in_deviations
+
+    count, d = station.shape
+    change, inner = np.eye(1 + d + count), in_deviations(rows, right)
+    change[1 + d :, 1 + d :], change[1 + d :, 0] = inner[:, :-1], inner[:, -1]
+    near = fix() if np.linalg.matrix_rank(rows) == count else None
+    if near is not None:
+        x, root = near
+        change[1 : 1 + d, 0], change[1 : 1 + d, 1 : 1 + d] = x, root
+        change[1 + d :, 0] = np.linalg.norm(x - station, axis=1)
+    return change
+
+
+def _scaled_fix(fix: Fix, origin: Array, unit: float) -> tuple[Array, Array] | None:
+    """Return position (d,) and triangular root (d, d) of its covariance in a unit; None without a covariance."""
+    d = len(origin)
+    x, cov = np.reshape(fix.position, (-1, d))[0], np.reshape(fix.cov, (-1, *fix.cov.shape[-2:]))[0, :d, :d]
+    if not (np.isfinite(x).all() and np.isfinite(cov).all()):
+        return None
+    try:
+        return (x - origin) / unit, np.linalg.cholesky(cov) / unit
+    except np.linalg.LinAlgError:  # a constraint fixes a direction
+        return None
 
 
 def range_rows(one: Problem, scale: float) -> tuple[Array, Array]:

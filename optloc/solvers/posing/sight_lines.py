@@ -78,7 +78,7 @@ def pose_minimax(problem: Problem, locate: Locate) -> ConicStatement:
     """Return the last cone program of the smallest maximal angle of a flat batch of one problem; `locate` is not used.
 
     It maximises the radius of a ball inside cones whose half-angles are the smallest maximal angle. The objective is
-    minus the radius, metres.
+    minus the radius, metres. The unit of length is the width of the widest cone at the fix.
     """
     from formulations.minimax_cone import ball_data, ball_problem, minimax, settings_of
 
@@ -88,19 +88,24 @@ def pose_minimax(problem: Problem, locate: Locate) -> ConicStatement:
     if found is None or cones is None or not np.isfinite(found.level):
         raise InvalidProblem("no position is in front of two bearings or more", "formulation", 'use "nls"')
     ahead, station, scale = cones
+    # In this unit the cones are about one wide at the fix, and the ball is inside them. In sizes of the array both are
+    # so small that duals have three digits only.
+    wide = max(found.level, 1.0) * np.max(scale * np.linalg.norm(found.point - station, axis=1))
+    size, centre = min(float(wide), 1.0), found.point
     program = ball_problem(*ahead.shape)
-    set_parameters(program, ball_data(ahead, station, scale, found.level))
-    point, unit = variable(program, "point"), float(seen.scale[0])
+    set_parameters(program, ball_data(ahead, (station - centre) / size, scale, found.level))
+    point, unit = variable(program, "point"), float(seen.scale[0]) * size
+    origin = seen.centre[0] + float(seen.scale[0]) * centre
 
     def read() -> Array:
-        return np.asarray(vectors(problem, seen.metres(point.value[None, None]))[0])
+        return np.asarray(vectors(problem, (origin + unit * point.value)[None, None])[0])
 
     return ConicStatement(
         program=program,
         size=unit,
-        origin=seen.centre[0],
+        origin=origin,
         unit=unit,
-        parts={"position": seen.centre[0] + unit * point, "radius": unit * variable(program, "radius")},
+        parts={"position": origin + unit * point, "radius": unit * variable(program, "radius")},
         missing={"residual": _NO_ANGLES},
         read=read,
         rank_ratio=lambda: np.nan,

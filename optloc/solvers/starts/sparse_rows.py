@@ -45,10 +45,8 @@ class RowWise:
 
     Parameters
     ----------
-    origin : array (N, d)
-        Metres.
-    scale : array (N,)
-        Metres.
+    coordinates : Coordinates
+        Origin and scale.
     rows, right : array (N, m, n), (N, m)
         Zero for a row that is absent or has no linear form.
     error : callable
@@ -59,8 +57,7 @@ class RowWise:
         Whether y contains ``|x|^2``, after x; the ranges to the q stations b are the last entries.
     """
 
-    origin: Array
-    scale: Array
+    coordinates: Coordinates
     rows: Array
     right: Array
     error: Callable[[Array | None], Array]
@@ -112,7 +109,7 @@ def row_wise(problem: Problem) -> RowWise:
     """
     size, d = problem.batch_shape[0], problem.dimension
     centre, spread = spread_of(problem)
-    origin, scale = np.broadcast_to(centre, (size, d)), np.broadcast_to(spread, (size,))
+    to = Coordinates(np.broadcast_to(centre, (size, d)), np.broadcast_to(spread, (size,)), on_cone=False)
     pairs = _references(problem)
     # columns of y: x, |x|^2, for each epoch t and |x|^2 - t^2, then the ranges to stations b
     first = d + 1 + 2 * problem.epochs
@@ -120,9 +117,9 @@ def row_wise(problem: Problem) -> RowWise:
     rows, right = np.zeros((size, problem.count, n)), np.zeros((size, problem.count))
     errors: list[tuple[slice, Callable[[Array | None], Array]]] = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
-        part = _lift_ranges(problem, block, start, origin, scale, pairs, first)
+        part = _lift_ranges(problem, block, start, to, pairs, first)
         # kinds without ranges, such as bearings
-        part = part or _lift_others(problem, block, start, Coordinates(origin, scale, False))
+        part = part or _lift_others(problem, block, start, to)
         if part is None:
             continue
         columns_of = slice(start, start + block.count)
@@ -140,8 +137,8 @@ def row_wise(problem: Problem) -> RowWise:
         return out
 
     apex = (np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0, pairs]
-            - origin[:, None]) / scale[:, None, None]  # fmt: skip
-    return RowWise(origin, scale, rows, right, error, apex, bool(rows[..., d].any()))
+            - to.origin[:, None]) / to.scale[:, None, None]  # fmt: skip
+    return RowWise(to, rows, right, error, apex, bool(rows[..., d].any()))
 
 
 def _references(problem: Problem) -> list[int]:
@@ -150,34 +147,25 @@ def _references(problem: Problem) -> list[int]:
     return sorted({int(b) for each in taken for b in each})
 
 
-def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
-    """Return the standard deviations (..., m) of the rows of one kind, with their weights.
-
-    `start` is the number of the first row of the kind in the problem.
-    """
-    weight = np.where(block.weight > 0.0, block.weight, 1.0)
-    return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
-
-
 def _lift_ranges(
-    problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
+    problem: Problem, block: Rows, start: int, to: Coordinates, pairs: list[int], first: int
 ) -> _SparsePart | None:
     """Return the linear rows of range measurements of one kind, or None for other kinds.
 
-    `start` is the number of the first row of the kind. `origin` and `scale` are as in `RowWise`. `pairs` are the
-    stations b, and `first` is the column of y of their first range.
+    `start` is the number of the first row of the kind, and `to` has the scaled coordinates. `pairs` are the stations b,
+    and `first` is the column of y of their first range.
     """
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
     if form is None:
         return None
-    place = problem.stations.position[..., 0, :, :]
-    a = (place[..., block.a, :] - origin[:, None]) / scale[:, None, None]
+    place, scale = problem.stations.position[..., 0, :, :], to.scale
+    a = (place[..., block.a, :] - to.origin[:, None]) / scale[:, None, None]
     m = (block.z - block.correction) / scale[:, None]
     # |x - a|^2 = m^2: -2 a x + |x|^2 = m^2 - |a|^2
     x, right, square = -2.0 * a, -(a**2).sum(-1), np.ones(block.count)
     others: tuple[tuple[Array, Array], ...] = ()
     if form[1]:
-        b = (place[..., block.b, :] - origin[:, None]) / scale[:, None, None]
+        b = (place[..., block.b, :] - to.origin[:, None]) / scale[:, None, None]
         # r_a = m - c r_b: the difference of both squares has 2 c m r_b for |x|^2
         x, right, square = x + 2.0 * b, right + (b**2).sum(-1), np.zeros(block.count)
         column = first + np.searchsorted(pairs, block.b)
@@ -187,7 +175,7 @@ def _lift_ranges(
         m = _centre(m, block)
         column = problem.dimension + 1 + 2 * block.epoch
         square, others = np.zeros(block.count), ((column, 2.0 * m), (column + 1, np.ones(block.count)))
-    sigma = _block_sigma(problem, block, start) / scale[:, None]
+    sigma = deviations(problem)[:, start : start + block.count] / scale[:, None]
 
     def error(point: Array | None) -> Array:
         # without a point, assume the measured distance, or at least the size of the network
@@ -240,7 +228,7 @@ def lift_positions(problem: Problem, otherwise: Callable[[Problem], Array]) -> t
         y, _, unsolved = _fit(lifts.rows, lifts.right, lifts.error(point), lifts)
         point, failed = y[:, : problem.dimension], failed | unsolved
     assert point is not None
-    position = point * lifts.scale[:, None] + lifts.origin
+    position = point * lifts.coordinates.scale[:, None] + lifts.coordinates.origin
     lost = np.flatnonzero(np.isnan(position).any(1) & ~failed)
     if len(lost):
         position[lost] = otherwise(problem.take(lost))

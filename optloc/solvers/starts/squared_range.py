@@ -113,16 +113,7 @@ def _first_pass(squared: Squared, pick: Pick) -> tuple[Array, Array, Array]:
 
 
 def last_weighting(problem: Problem, found: Ranges | None, pick: Pick) -> tuple[Squared, Array, Array]:
-    """Return the squared-range problem whose solutions `candidates` returns.
-
-    Parameters
-    ----------
-    problem : Problem
-        N problems.
-    found : Ranges, optional
-        Its least-squares ranges.
-    pick : callable
-        As in `candidates`.
+    """Return the squared-range problem whose solutions `candidates` returns; arguments as of `candidates`.
 
     Returns
     -------

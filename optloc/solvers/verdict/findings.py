@@ -312,6 +312,8 @@ def _departure(problem: Problem, pool: Pool) -> Array:
         free, x = unfenced(problem, x, covariance), np.array(x)
         x[:, : free.shift.shape[1]] += free.shift
         problem, covariance = replace(problem, fences=()), free.covariance
+        if not problem.batch_shape:  # only the fences had the batch axis
+            problem = problem.with_rows(z=np.broadcast_to(problem.z, (len(x), *problem.z.shape)))
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
     sides = faces(problem) if problem.constraints else [()]
     out = np.empty((len(x), 2))

@@ -166,3 +166,11 @@ def test_a_free_target_has_a_chance_at_each_epoch():
     assert constraints.chance(solve(problem), square) == pytest.approx([1.0, 0.0])
     with pytest.raises(InvalidProblem, match="that all epochs share"):
         constraints.chance(solve(with_bias(problem, "offset", per="kind")), square)
+
+
+def test_a_fence_and_a_region_of_another_dimension_have_no_chance():
+    fix = located(1)
+    with pytest.raises(InvalidProblem, match="uncertain fence"):
+        constraints.chance(fix, constraints.fence((1.0, 0.0), 5.0, 2.0))
+    with pytest.raises(InvalidProblem, match="give 2 numbers"):
+        constraints.chance(fix, constraints.ball((0.0, 0.0, 0.0), 5.0))

@@ -10,8 +10,8 @@ from optloc import Motion, assemble, constraints, crlb, measured, solve
 
 CASES = [(name, judge.verdict) for name in judge.ALL] + [(name, courses.verdict) for name in courses.ALL]
 NAMES = [name for name, _ in CASES]
-# Those of every run; the others are slow together.
-OFTEN = {"keep_out_disc", "keep_out_polygon", "polyline", "any_of", "pairs_apart", "turns", "on_the_ground"}
+# Those of every run; the others are slow together. IPOPT solves roads and keep-out polygons in every run, see below.
+OFTEN = {"keep_out_disc", "any_of", "pairs_apart", "turns", "on_the_ground"}
 EACH = [pytest.param(*case, id=case[0], marks=[] if case[0] in OFTEN else [pytest.mark.slow]) for case in CASES]
 TARGET = np.array([400.0, 300.0])
 

@@ -77,9 +77,9 @@ def test_a_bound_that_changes_nothing_leaves_the_fix_and_its_status():
 
 def test_a_batch_has_one_answer_for_each_problem():
     rng = np.random.default_rng(3)
-    z = np.linalg.norm(PLANE - TARGET, axis=1) + 10.0 * rng.standard_normal((5, 4))
+    z = np.linalg.norm(PLANE - TARGET, axis=1) + 10.0 * rng.standard_normal((3, 4))
     limits = constraints.polyline(TARGET + np.array([[-90.0, 40.0], [0.0, 10.0], [90.0, 40.0]]), 8.0)
     together = solve(assemble(PLANE, measured("range", z, a=range(4), sigma=10.0), constraints=limits))
-    for i in range(5):
+    for i in range(3):
         alone = solve(ranges_to(TARGET, limits, z=z[i]))
         np.testing.assert_allclose(together.position[i], alone.position, atol=1e-5)

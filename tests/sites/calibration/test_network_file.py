@@ -87,3 +87,57 @@ def test_what_is_found_is_a_problem_file_whose_clocks_are_taken_off(path, tmp_pa
     np.testing.assert_allclose(problem.observed.reshape(6, 5), apart + truth.emission[0][:, None], atol=1e-9)
     with pytest.raises(InvalidProblem, match=r"its name must end in \.toml"):
         write_calibrated(found, "Hall", tmp_path / "found.csv", path)
+
+
+WAYS = """
+format = 1
+propagation_speed = "1500 m/s"
+[stations]
+rows = [{ name = "A" }, { name = "B" }]
+[[measurements]]
+kind = "range"
+unit = "ms"
+sigma = "0.2 ms"
+two_way = true
+turn_around = "15 ms"
+rows = [{ epoch = "p", a = "A", z = 55.0 }, { epoch = "p", a = "B", z = 35.0 }]
+"""
+
+
+def test_two_way_times_are_halved_without_the_turn_around(path):
+    path.write_text(WAYS)
+    net = read_network(path)
+    assert net.z.tolist() == [[pytest.approx(30.0), pytest.approx(15.0)]]
+    assert net.sigma.tolist() == [[pytest.approx(0.15), pytest.approx(0.15)]]
+    path.write_text(WAYS.replace('two_way = true\nturn_around = "15 ms"\n', ""))
+    same = read_network(path, two_way=True, turn_around="15 ms")
+    assert np.allclose(same.z, net.z)
+    made = network_of(
+        [[0.055, 0.035]], 2e-4, kind="range", wave_speed=1500.0, two_way=True, turn_around="15 ms", dimension=2
+    )
+    assert np.allclose(made.z, net.z)
+    assert np.allclose(made.sigma, net.sigma)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('kind = "range"', 'kind = "toa"', "has no way back"),
+        ('"15 ms"', '"-2 ms"', "negative"),
+        ('unit = "ms"\nsigma = "0.2 ms"', 'unit = "m"\nsigma = "0.2 m"', "two-way ranges are times"),
+    ],
+)
+def test_wrong_two_way_times_are_named(path, old, new, said):
+    path.write_text(WAYS.replace(old, new))
+    with pytest.raises(InvalidProblem, match=said):
+        read_network(path)
+
+
+def test_two_way_options_need_ranges_that_are_times(path):
+    path.write_text(TEXT)
+    with pytest.raises(InvalidProblem, match="the file has no ranges"):
+        read_network(path, two_way=True)
+    with pytest.raises(InvalidProblem, match="need a wave speed"):
+        network_of([[1.0, 2.0]], 0.1, kind="range", two_way=True, dimension=2)
+    with pytest.raises(InvalidProblem, match="toa has no way back"):
+        network_of([[1.0, 2.0]], 0.1, turn_around="2 ms", wave_speed=1500.0, dimension=2)

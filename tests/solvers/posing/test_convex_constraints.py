@@ -15,7 +15,7 @@ def test_planes_have_unit_normals_and_both_sides():
     assert isinstance(one, HalfSpace)
     assert one.normal == pytest.approx([0.6, 0.8])
     assert one.offset == pytest.approx(2.0)
-    low, high = as_convex(FLAT, constraints.band([1.0, 0.0], -2.0, 5.0)[0])[::-1]
+    low, high = as_convex(FLAT, constraints.band([1.0, 0.0], -2.0, 5.0)[0])
     assert (low.normal[0], low.offset, high.normal[0], high.offset) == (-1.0, 2.0, 1.0, 5.0)
     (line,) = as_convex(FLAT, constraints.band([0.0, 1.0], 3.0, 3.0)[0])
     assert line.equal

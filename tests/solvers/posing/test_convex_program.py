@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem
-from optloc.solvers.posing.convex_program import ConvexProgram, joined
+from optloc.solvers.posing.convex_program import ConvexProgram
+from optloc.solvers.posing.posed_problem import PosedProblem
 
 
 def program(size=1.0):
@@ -29,37 +30,32 @@ KINDS = {
 def test_a_dual_is_the_slope_in_the_units_of_the_user(kind):
     def at(e):
         own, x = program(50.0)
-        own.relations["it"] = own.relation(KINDS[kind](1e3 * x, e), "it")
-        own.restate()
-        report = own.solve("CLARABEL", {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}, warm=False)
-        assert own.has_solution(report)
-        return own.results(solved=True), own.bound()
+        PosedProblem(own).add(KINDS[kind](1e3 * x, e), name="it")
+        found = own.solution("clarabel", {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11})
+        assert own.has_solution(found.backend)
+        return found
 
     step = 1e3 if kind == "square" else 1.0
-    (duals, values, value), bound = at(0.0)
-    slope = -(at(step)[0][2] - at(-step)[0][2]) / (2.0 * step) * (-1.0 if kind == "greater" else 1.0)
-    assert duals["it"] == pytest.approx(slope, rel=2e-4)
-    assert values["it"] == pytest.approx(0.0, abs=1e-3 * step)
-    assert bound == pytest.approx(value, rel=1e-5)
-    assert bound <= value * (1.0 + 1e-8)
+    found = at(0.0)
+    slope = -(at(step).value - at(-step).value) / (2.0 * step) * (-1.0 if kind == "greater" else 1.0)
+    assert found.duals["it"] == pytest.approx(slope, rel=2e-4)
+    assert found.values["it"] == pytest.approx(0.0, abs=1e-3 * step)
+    assert found.bound == pytest.approx(found.value, rel=1e-5)
+    assert found.bound <= found.value * (1.0 + 1e-8)
 
 
-def test_a_semidefinite_relation_and_several_relations_of_one_name():
+def test_a_semidefinite_relation():
     own, x = program()
-    own.relations["it"] = own.relation(cp.bmat([[x[0:1, None], x[1:2, None]], [x[1:2, None], np.eye(1)]]) >> 0, "it")
-    own.restate()
-    assert own.has_solution(own.solve("CLARABEL", None, warm=False))
-    duals, values, _ = own.results(solved=True)
-    assert np.shape(duals["it"]) == (2, 2)
-    assert np.linalg.eigvalsh(values["it"])[0] > -1e-6
-    assert joined([np.array(1.0)]) == 1.0
-    assert joined([np.array(1.0), np.array([2.0, 3.0])]).tolist() == [1.0, 2.0, 3.0]
+    PosedProblem(own).add(cp.bmat([[x[0:1, None], x[1:2, None]], [x[1:2, None], np.eye(1)]]) >> 0, name="it")
+    found = own.solution(None, None)
+    assert own.has_solution(found.backend)
+    assert np.shape(found.duals["it"]) == (2, 2)
+    assert np.linalg.eigvalsh(found.values["it"])[0] > -1e-6
 
 
 def test_first_order_solvers_start_warm_and_others_say_that_they_do_not():
     own, x = program()
-    own.relations["it"] = own.relation(cp.norm(x) <= 1.0, "it")
-    own.restate()
+    PosedProblem(own).add(cp.norm(x) <= 1.0, name="it")
     own.solve("SCS", {"eps_abs": 1e-8, "eps_rel": 1e-8}, warm=False)
     report = own.solve("SCS", {"eps_abs": 1e-8, "eps_rel": 1e-8}, warm=True, start=own.variables())
     assert report.message == ""

@@ -167,3 +167,12 @@ def test_failed_solves_are_statuses():
     assert "no least value" in str(fix.reason)
     stopped = pose(problem, "hull").solve(settings={"max_iter": 1})
     assert stopped.status == Status.NUMERICAL
+
+
+def test_an_unbounded_objective_of_a_relaxation_has_no_position():
+    posed = pose(differences(3, scale=600.0), "shor")
+    posed.minimise(posed.position[0])
+    fix = posed.solve()
+    assert fix.status == Status.NUMERICAL
+    assert "least value" in str(fix.reason)
+    assert np.isnan(fix.position).all()

@@ -28,7 +28,7 @@ def test_the_cones_have_the_smallest_maximal_angle():
     ahead, station, scale = cones_of(seen, 0)
     level = minimax(ahead, station, scale).level
     posed = pose(problem, "minimax_cone")
-    point = posed.scaled(posed.solve(refine=False).position)
+    point = (posed.solve(refine=False).position - seen.centre[0]) / seen.scale[0]
     assert (angles(point, ahead, station) / scale).max() == pytest.approx(level, rel=1e-3)
     assert float(posed.of("radius").value) == pytest.approx(0.0, abs=1e-3 * posed.unit)
 
