@@ -343,8 +343,8 @@ def crlb(
         raise typer.Exit(drawn)
     from optloc.cli.crlb import run_crlb
 
-    printed = {"as_json": as_json, "plot": plot, "quiet": quiet}
-    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, **printed, more=more))
+    code = run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot, quiet=quiet, more=more)
+    raise typer.Exit(code)
 
 
 @app.command(

@@ -85,7 +85,7 @@ def run_check(
     checked = _health(loaded, options, quiet or as_json)
     advice = _advice(loaded, checked)
     if as_json:
-        more = {} if checked is None else {"health": _health_json(checked)}
+        more: dict[str, Any] = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
         more |= {"warnings": list(loaded.warnings)} if loaded.warnings else {}

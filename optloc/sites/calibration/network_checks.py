@@ -149,9 +149,9 @@ def _pairs_problem(network: Network) -> Problem | None:
     position[:, 1, 0] = distances
     parts = []
     for kind, found in rows.items():
-        epoch, end, z, sigma = (np.array(column) for column in zip(*found, strict=True))
+        epochs, ends, z, sigma = (np.array(column) for column in zip(*found, strict=True))
         second = {"b": 1} if MODELS[kind].stations == 2 else {}
-        parts.append(measured(kind, z, a=end, epoch=epoch, sigma=sigma, **second))
+        parts.append(measured(kind, z, a=ends, epoch=epochs, sigma=sigma, **second))
     times = np.arange(float(len(distances)))
     return assemble(position, *parts, times=times, motions=(Motion(0, span="epoch"),))
 
