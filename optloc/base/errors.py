@@ -56,7 +56,8 @@ class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named after the i
         """Return the message: location, fault and advice in one sentence."""
         place = f"{_shown(self.where)}: " if self.where else ""
         advice = f"; {_shown(self.advice.strip().rstrip('.'), 4 * _SHOWN)}" if self.advice else ""
-        return f"{place}{_shown(self.what.strip().rstrip('.'))}{advice}."
+        end = "" if advice.endswith("?") else "."
+        return f"{place}{_shown(self.what.strip().rstrip('.'))}{advice}{end}"
 
 
 # Maximum number of characters of the location and of the fault, about three lines: a file can contain a megabyte where

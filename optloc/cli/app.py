@@ -311,6 +311,7 @@ def crlb(
     height: MapHeight = None,
     extent: MapExtent = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
+    constraint: Constraint = None,
     status: StatusShares = False,
     trials: SimulatedFixes = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers of --status.")] = 0,
@@ -325,21 +326,25 @@ def crlb(
 
     If the epochs of a run share unknowns (a motion, biases), the bound after the first 1, 2, ... epochs is printed as
     well. With --map, the bound is drawn as a map over target positions instead. With --status, measurements are
-    simulated; the share of fixes with each status is printed, or drawn as a map.
+    simulated; the share of fixes with each status is printed, or drawn as a map. Exact constraints, such as
+    --constraint 'height exactly=2 m', lower the bound; other constraints do not change it.
     """
+    more = constraints(None, False, None, constraint or ())
     if status:
         from optloc.cli.crlb import Simulated, run_status
 
         wanted = Simulated(map_, at, height, extent, velocity, trials, seed, geodetic)
-        raise typer.Exit(run_status(file, wanted, as_json=as_json, quiet=quiet))
+        raise typer.Exit(run_status(file, wanted, as_json=as_json, quiet=quiet, more=more))
     # A map needs no true position: it is drawn around the stations, or around the fix.
     if map_ is not None:
         from optloc.cli.crlb import run_map
 
-        raise typer.Exit(run_map(file, map_, at, height, extent, velocity, geodetic=geodetic, dilution=dilution))
+        drawn = run_map(file, map_, at, height, extent, velocity, geodetic=geodetic, dilution=dilution, more=more)
+        raise typer.Exit(drawn)
     from optloc.cli.crlb import run_crlb
 
-    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot, quiet=quiet))
+    code = run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot, quiet=quiet, more=more)
+    raise typer.Exit(code)
 
 
 @app.command(

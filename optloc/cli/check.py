@@ -36,6 +36,7 @@ from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
 from optloc.model_checks.elements import By, batch_of
 from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
+from optloc.model_checks.plausibility import CHECKS
 from optloc.models import MODELS
 from optloc.problem.epoch_groups import explanations_by_epoch
 from optloc.problem.epochs import by_epoch, separable
@@ -84,9 +85,10 @@ def run_check(
     checked = _health(loaded, options, quiet or as_json)
     advice = _advice(loaded, checked)
     if as_json:
-        more = {} if checked is None else {"health": _health_json(checked)}
+        more: dict[str, Any] = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
+        more |= {"warnings": list(loaded.warnings)} if loaded.warnings else {}
         write_text(Path("-"), dumps(found | table_json(loaded) | more | {"advice": advice_json(advice)}))
     elif not quiet:
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
@@ -133,7 +135,10 @@ def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
         from optloc.solvers.solution import solve
 
         vectors = solve(problem).x
-    return advice_for_vectors(problem, vectors)
+    found = advice_for_vectors(problem, vectors)
+    # The warnings of physical checks are printed before the summary.
+    told = {check.name for check in CHECKS} if loaded.warnings else set()
+    return tuple(one for one in found if one.cause not in told)
 
 
 def _spell(value: Any) -> str:
@@ -296,7 +301,9 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     """
     problem = loaded.problem
     if problem.epochs < 2:
-        return Checked(None, "station health needs several epochs; the file has one")
+        return Checked(
+            None, "station health needs several epochs, and the file has one; add epochs to test the stations"
+        )
     # Epochs of a calibration share no unknowns, though the known track makes their problem inseparable.
     calibrating = all(motion.known is not None for motion in problem.motions)
     if not separable(problem) and not (calibrating and not problem.biases):

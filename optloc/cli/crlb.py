@@ -6,7 +6,7 @@ position is latitude, longitude and height. `limits` is the extent of a map as t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +22,7 @@ from optloc.bounds.cramer_rao import Course, crlb_course
 from optloc.bounds.over_area import BoundMap, bound_map, extent, map_coordinates
 from optloc.cli.options import coordinates
 from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
+from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded, read
 from optloc.files.settings import Units
 from optloc.model_checks.evidence import Reliability, reliability
@@ -46,6 +47,8 @@ _STATUS_POINTS = 24
 _TRIALS, _TRIALS_OF_A_MAP = 200, 50
 _UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
+More = Mapping[str, ConstraintTable] | None
+"""Constraints that options add to a file, by the name of the option."""
 
 
 def run_crlb(
@@ -57,6 +60,7 @@ def run_crlb(
     as_json: bool,
     plot: Path | None = None,
     quiet: bool = False,
+    more: More = None,
 ) -> int:
     """Print the Cramer-Rao bound at a true position or at the fix, and draw it against time in the file `plot`.
 
@@ -65,13 +69,15 @@ def run_crlb(
     """
     from optloc.bounds.cramer_rao import crlb
 
-    loaded = read(file, values=False)
+    loaded = read(file, values=False, more=more)
     claim_outputs(picture=plot, inputs=[file])
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     if not problem.layout.n_shared:
         raise InvalidProblem("no unknown is shared by the epochs", loaded.source, "add a bias")
     # Biases of known targets alone need no target position: their bound does not depend on it.
-    truth = _solve(file) if at is None and _has_unknown_position(problem) else vector(problem, at, velocity, geodetic)
+    truth = (
+        _solve(file, more) if at is None and _has_unknown_position(problem) else vector(problem, at, velocity, geodetic)
+    )
     bound = np.asarray(crlb(problem, truth))
     # Identical epochs have one bound: broadcast it to all epochs.
     bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
@@ -103,12 +109,11 @@ def _has_unknown_position(problem: Problem) -> bool:
     return any(motion.known is None for motion in problem.motions)
 
 
-def _solve(file: Path) -> Array:
+def _solve(file: Path, more: More) -> Array:
     """Return the estimate (..., size) of a file that has measured values."""
     from optloc.solvers.solution import solve
 
-    problem = read(file).problem
-    return solve(problem).x
+    return solve(read(file, more=more).problem).x
 
 
 def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | None) -> None:
@@ -323,6 +328,7 @@ def run_map(
     *,
     geodetic: bool,
     dilution: bool,
+    more: More = None,
 ) -> int:
     """Write the map of the bound of a file. If epochs are separate, the map is of the first epoch.
 
@@ -332,11 +338,11 @@ def run_map(
     if out.suffix.lower() not in (*PICTURES, ".html", ".geojson"):
         advice = "use .png, .svg, .pdf, .geojson or .html"
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
-    loaded = read(file, values=False)
+    loaded = read(file, values=False, more=more)
     claim_outputs(out, inputs=[file])
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, at, velocity, geodetic)
-    grid, level = _grid(file, problem, at, truth, height, limits, _MAP_POINTS)
+    grid, level = _grid((file, more), problem, at, truth, height, limits, _MAP_POINTS)
     found = bound_map(problem, truth, *grid, level)
     what = "dilution of precision" if dilution else "bound of the position error"
     _write_map(found, out, f"{loaded.title}: {what}", dilution=dilution)
@@ -350,19 +356,25 @@ def _of_one_epoch(problem: Problem) -> Problem:
 
 
 def _grid(
-    file: Path, problem: Problem, at: str | None, truth: Array, height: str | None, limits: str | None, points: int
+    file: tuple[Path, More],
+    problem: Problem,
+    at: str | None,
+    truth: Array,
+    height: str | None,
+    limits: str | None,
+    points: int,
 ) -> tuple[tuple[Array, Array], float]:
     """Return the coordinates (points,) of a map along both sides, and the height of the map, m.
 
     The coordinates are in degrees on Earth, else in metres. Of a problem in space, the map is a horizontal plane. Its
-    height is `height`, or the height of the stated position or of the fix.
+    height is `height`, or the height of the stated position or of the fix. `file` has the constraints of options, too.
     """
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
     return (np.linspace(x0, x1, points), np.linspace(y0, y1, points)), _height(problem, place, height)
 
 
-def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
+def _place(file: tuple[Path, More], problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
     """Return the position (1, d) that the user states, m, or the fix; None if no position is needed.
 
     `truth` (size,) has the stated position. With several unknown targets, the stated position is not used. `needed` is
@@ -376,7 +388,7 @@ def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed
         return None
     from optloc.solvers.solution import solve
 
-    fix = solve(read(file).problem)
+    fix = solve(read(file[0], more=file[1]).problem)
     place = fix.position.reshape(-1, problem.dimension)
     good = place[np.isfinite(place).all(-1)]
     if not len(good):
@@ -451,18 +463,18 @@ class Simulated(NamedTuple):
     geodetic: bool
 
 
-def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool) -> int:
+def run_status(file: Path, wanted: Simulated, *, as_json: bool, quiet: bool, more: More = None) -> int:
     """Print the shares of the statuses of simulated fixes, or write their map, and return the exit code."""
-    loaded = read(file, values=False)
+    loaded = read(file, values=False, more=more)
     if wanted.out is not None:
-        _map_status(file, loaded, wanted, wanted.out)
+        _map_status((file, more), loaded, wanted, wanted.out)
         return 0
     from optloc.solvers.shares import status_shares
 
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
     if wanted.at is None and _has_unknown_position(problem):
-        truth = _solve(file).reshape(-1, len(truth))[0]
+        truth = _solve(file, more).reshape(-1, len(truth))[0]
         if not np.isfinite(truth).all():
             raise InvalidProblem("the file has no fix as true position", loaded.source, "give a position with --at")
     found = status_shares(problem, truth, wanted.trials or _TRIALS, wanted.seed)
@@ -491,7 +503,7 @@ def _show_status(found: StatusShares, title: str) -> None:
         )
 
 
-def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> None:
+def _map_status(file: tuple[Path, More], loaded: Loaded, wanted: Simulated, out: Path) -> None:
     """Write the map of the share of fixes with the status `ok` to the file `out`; `wanted` has the options."""
     from optloc.show.pictures import plot_status_map, status_geojson
     from optloc.solvers.shares import status_map
@@ -500,7 +512,7 @@ def _map_status(file: Path, loaded: Loaded, wanted: Simulated, out: Path) -> Non
     if ending not in (*PICTURES, ".geojson"):
         advice = "use .png, .svg, .pdf or .geojson"
         raise InvalidProblem(f"status maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
-    claim_outputs(out, inputs=[file])
+    claim_outputs(out, inputs=[file[0]])
     problem = _of_one_epoch(loaded.problem)
     truth = vector(problem, wanted.at, wanted.velocity, wanted.geodetic)
     grid, level = _grid(file, problem, wanted.at, truth, wanted.height, wanted.limits, _STATUS_POINTS)

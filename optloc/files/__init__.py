@@ -38,7 +38,12 @@ if TYPE_CHECKING:
     )
     from optloc.files.one_call import locate as locate
     from optloc.files.orbits import satellites as satellites
-    from optloc.files.propagation import positive_speed as positive_speed, speed_of as speed_of
+    from optloc.files.propagation import (
+        fits_sound as fits_sound,
+        is_time as is_time,
+        positive_speed as positive_speed,
+        speed_of as speed_of,
+    )
     from optloc.files.reader import (
         Draft as Draft,
         Loaded as Loaded,

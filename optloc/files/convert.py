@@ -22,7 +22,7 @@ from optloc.base.outputs import claim
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.cell_text import Decimals
-from optloc.files.columns import PLACE, role_named, role_of
+from optloc.files.columns import PLACE, is_sigma, role_named, role_of, stem
 from optloc.files.crust import crust_of
 from optloc.files.csv_formats import read_table
 from optloc.files.declination import declination_of
@@ -281,7 +281,7 @@ def _with_station(roles: Roles, stations: ColumnPlaces) -> Roles:
     found = [name for name in text_columns(roles.table, taken) if holds_names(roles.table, name, stations.names)]
     if len(found) != 1 or role_of(found[0]) is not None:
         return roles
-    note = f"the column {found[0]!r} has the station of each row: no other column fits"
+    note = f"the column {found[0]!r} has the station of each row; --column station=NAME states another"
     table = replace(roles.table, notes=(*roles.table.notes, note))
     return replace(roles, table=table, by_role={**roles.by_role, "station": found[0]})
 
@@ -334,6 +334,7 @@ def _plan(
     stations = in_space(stations) if any(2 not in MODELS[one.form.kind].dimensions for one in found) else stations
     stations, heading_note = stations_turned(stations, found)
     epochs = epochs_of(roles, hints, found)
+    _check_unit(hints, found)
     sigmas = _sigmas(hints, found)
     uses = uses_of(roles, hints, found, epochs, sigmas)
     check_receivers(roles.table, uses, named, stations.names)
@@ -343,17 +344,28 @@ def _plan(
     notes = [*roles.table.notes, *(one.notes[0] for one in found if one.heading is not None)]
     notes += [note for note in (heading_note, stations.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
-    lines, after, frame, sections = _with_waves(sections, found, hints, stations, notes)
+    lines, after, frame, sections, speeds = _with_waves(sections, found, hints, stations)
     # With a column "epoch", the window was already used to make its labels.
     if hints.window is not None and "epoch" not in epochs:
         after += ("", "[epochs]", f"window = {json.dumps(hints.window)}")
+    replaced = [name for name in rest if is_sigma(stem(name))] if hints.sigma is not None else []
+    notes += [f"--sigma replaces the column {name}; remove one of them" for name in replaced]
     height, note = _height(found, stations)
     notes += [*_few(sections, hints), *([note] if note else [])]
     read = [
         *reading_lines(roles, hints, stations, found, epochs, uses),
+        *([("waves", speeds)] if speeds else []),
         *([("not used", ", ".join(rest))] if rest else []),
     ]
     return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses, frame)
+
+
+def _check_unit(hints: ColumnHints, found: Sequence[Readings]) -> None:
+    """Raise InvalidProblem for a stated unit that no sort of readings can have, such as degrees for times."""
+    known = [list(UNITS[one.form.quantity]) for one in found]  # type: ignore[index]  # models hold known quantities only
+    if hints.unit is not None and not any(hints.unit in units for units in known):
+        what = f"{hints.unit!r} is not a unit of {found[0].form.text}"
+        raise InvalidProblem(what, "--unit", nearest(hints.unit, known[0]))
 
 
 def _stated_height(given: str) -> str:
@@ -379,7 +391,8 @@ def _height(found: Sequence[Readings], stations: ColumnPlaces) -> tuple[str, str
         return f'exactly = "{mean!r} {unit}"', remark
     if any(one.form.value in ("sp", "picks") for one in found):
         top = float(heights.max())
-        return f'max = "{top!r} {unit}"', f"the earthquake is assumed below the highest station, {top:g} {unit}"
+        remark = f"the earthquake is assumed below the highest station, {top:g} {unit}; --height states other limits"
+        return f'max = "{top!r} {unit}"', remark
     return "", ""
 
 
@@ -413,33 +426,33 @@ def _with_waves(
     found: Sequence[Readings],
     hints: ColumnHints,
     stations: ColumnPlaces,
-    notes: list[str],
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], tuple[Section, ...]]:
-    """Return lines of the file for P and S waves, and the sections with their phases.
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], tuple[Section, ...], str]:
+    """Return lines of the file for P and S waves, the sections with their phases, and their speeds for the report.
 
-    The lines are before the tables, after them, and in the frame.
-
-    A note on the speeds is added to `notes`.
+    The lines are before the tables, after them, and in the frame. Raise InvalidProblem for speeds of P and S waves
+    that no reading uses.
     """
     if any(one.form.value == "sp" for one in found):
         crust = crust_of(hints, with_s=True)
         if crust.speed is None or crust.vp_vs is None:
             raise InvalidProblem("S minus P alone needs two speeds", "--vp", "leave --as sp out to use layers")
         speed = crust.speed / (crust.vp_vs - 1.0)
-        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)")
-        return (f"propagation_speed = {speed!r}",), (), (), sections
+        words = f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range (straight rays, constant speeds)"
+        return (f"propagation_speed = {speed!r}",), (), (), sections, words
     if found[0].form.value != "picks":
-        return (), (), (), sections
+        if hints.vp is not None or hints.vs is not None:
+            advice = "remove this option, use --wave-speed for other waves, or name the columns with --column p=, s="
+            raise InvalidProblem("the table has no picks of P and S", "--vp" if hints.vp else "--vs", advice)
+        return (), (), (), sections, ""
     waves = waves_of(found[0])
     crust = crust_of(hints, with_s=waves is not None)
-    notes.append(crust.note)
     if waves is not None:
         section = sections[0]
         lines = (*section.lines, f"vp_vs = {crust.ratio}")
         sections = (replace(section, columns={**section.columns, "phase": waves}, lines=lines),)
     heights = stations.columns.get("height", stations.columns.get("z"))
     highest = 0.0 if heights is None else float(np.max(heights)) * UNITS["length"][stations.unit]
-    return crust.lines, crust.medium(highest), crust.frame(stations), sections
+    return crust.lines, crust.medium(highest), crust.frame(stations), sections, crust.note
 
 
 def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) -> Section:
@@ -520,7 +533,7 @@ def _few(sections: Sequence[Section], hints: ColumnHints) -> list[str]:
     counts = np.bincount(equal_rows(columns, len(columns[0]))[1])
     few = int((counts < _FEW).sum())
     if sections[0].kind == "toa" and few:
-        return [f"{few} of {len(counts)} messages were received by fewer than three stations"]
+        return [f"{few} of {len(counts)} messages were received by fewer than three stations; add stations to fix them"]
     if len(counts) > 1 and counts.max() == 1 and hints.window is None:
         advice = "use --still if the target does not move, or --window '0.1 s' to join readings within 0.1 s"
         return [f"each of the {len(counts)} times has one reading: {advice}"]

@@ -55,7 +55,7 @@ def sound_events(text: str, source: str) -> Table:
     if not rows:
         what = "no event has delays"
         raise InvalidProblem(what, source, "run estimate_location of opensoundscape, then save events_to_df")
-    notes = (f"events without delays are left out: {lacking}",) if lacking else ()
+    notes = (f"events without delays are left out: {lacking}; add their delays to use them",) if lacking else ()
     return replace(of_rows(rows, source, {}), notes=notes)
 
 

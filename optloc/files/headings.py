@@ -98,7 +98,7 @@ def stations_turned(stations: ColumnPlaces, found: Sequence[Readings]) -> tuple[
             f"station {lacking!r} has no heading", "--stations", "give a heading for each station, 0 for north"
         )
     # A station without bearings may lack a heading. Zero is then stored, without an effect.
-    note = "bearings are relative to the headings of the stations in their table"
+    note = "bearings are relative to the headings of the stations in their table; remove them if they are true"
     return replace(stations, columns={**stations.columns, "heading_deg": np.nan_to_num(headings)}), note
 
 

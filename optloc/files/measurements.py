@@ -82,6 +82,8 @@ class RowChunk:
         For arrivals with a phase: the speed of P waves divided by the speed of S waves, or "layers".
     combination : Combination, optional
         For combinations of such arrivals: the source of their noise.
+    sigma_replaced : bool
+        Whether a column of the table replaces the stated sigma of the section.
     after : "time" or "date", optional
         For arrivals: z is seconds after the column time, or after the date that it contains.
     """
@@ -112,6 +114,7 @@ class RowChunk:
     declination: Array | None = None
     vp_vs: float | str | None = None
     combination: Combination | None = None
+    sigma_replaced: bool = False
     after: str | None = None
 
     @property
@@ -200,6 +203,7 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
         section.excess and _is_range_sum(model), table, day, vp_vs=section.vp_vs,
+        sigma_replaced=table.has("sigma") and section.sigma is not None,
         after=section.after if kind == "toa" else None,
     )  # fmt: skip
 

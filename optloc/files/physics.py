@@ -36,7 +36,13 @@ def warnings_of(
     units = {chunk.kind: abs(float(chunk.unit.factor)) for chunk in chunks}
     speed = chunks[0].units.speed if chunks else None
     found = suspicious_values(problem, surface, units=units, speed=speed)
-    return (*(f"{one.seen}; {one.advice}" for one in found), *_wraps(chunks))
+    return (*(f"{one.seen}; {one.advice}" for one in found), *_wraps(chunks), *_unused_sigmas(chunks))
+
+
+def _unused_sigmas(chunks: Sequence[RowChunk]) -> Iterator[str]:
+    """Yield a sentence for each table whose column sigma replaces the key sigma of its section."""
+    replaced = dict.fromkeys(chunk.table.source for chunk in chunks if chunk.sigma_replaced)
+    yield from (f"the column sigma of {source} replaces the key sigma; remove one of them" for source in replaced)
 
 
 def _wraps(chunks: Sequence[RowChunk]) -> Iterator[str]:

@@ -63,7 +63,7 @@ def hypo71(text: str, source: str) -> Table:
                 continue
             weighted += weight in _SHARES
             rows.append({"event": event, **row, SHARE: _SHARES.get(weight, 1.0)})
-    notes = [f"picks with weight 4 are left out: {unused}"] if unused else []
+    notes = [f"picks with weight 4 are left out: {unused}; change their weight to use them"] if unused else []
     if weighted:
         notes.append(
             f"{weighted} picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight: "
@@ -140,7 +140,11 @@ def nonlinloc(text: str, source: str) -> Table:
             continue
         sigma = error if error > 0.0 and cells[9] == "GAU" else None
         rows.append({"event": event, "station": cells[0], "phase": cells[4], "time": time, "sigma_s": sigma})
-    return _table(rows, source, [f"picks with prior weight 0 are left out: {unused}"] if unused else [])
+    return _table(
+        rows,
+        source,
+        [f"picks with prior weight 0 are left out: {unused}; change their weight to use them"] if unused else [],
+    )
 
 
 def quakeml(text: str, source: str) -> Table:
@@ -172,7 +176,11 @@ def quakeml(text: str, source: str) -> Table:
             deviation = pick.time_errors.uncertainty if pick.time_errors else None
             sigma = float(deviation) if deviation else None
             rows.append({"event": number, "station": station, "phase": phase, "time": str(pick.time), "sigma_s": sigma})
-    notes = [f"picks that are rejected, or without phase or station, are left out: {unknown}"] if unknown else []
+    notes = (
+        [f"picks that are rejected, or without phase or station, are left out: {unknown}; complete them to use them"]
+        if unknown
+        else []
+    )
     return _table(rows, source, notes)
 
 

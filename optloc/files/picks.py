@@ -89,7 +89,11 @@ def differences(roles: Roles, hints: ColumnHints) -> Readings:
     if not both:
         raise InvalidProblem("no station has both P and S", roles.table.source, "leave --as sp out")
     n_without_pair = len({name for _, name in keys}) - len({keys[i][1] for i, _ in both})
-    notes = (f"{n_without_pair} stations without both P and S are left out",) if n_without_pair else ()
+    notes = (
+        (f"{n_without_pair} stations without both P and S are left out; remove --as sp to use them",)
+        if n_without_pair
+        else ()
+    )
     pairs = found.take(np.array([i for i, _ in both]))
     last = np.full(len(both), len(found.headers) - 1)
     # The stated sigma is of a difference of two picks of full weight.
@@ -120,7 +124,7 @@ def _picks(roles: Roles, hints: ColumnHints) -> tuple[list[Pick], tuple[str, ...
     picks = [(row, wave, time, 0) for row, time in _times(roles, hints, "time") if (wave := waves[row]) is not None]
     other = [str(word) for word, wave in zip(phase, waves, strict=True) if wave is None]
     names = ", ".join([*dict.fromkeys(other)][:_SHOWN])
-    note = f"picks of other phases than P and S are left out: {len(other)} ({names})"
+    note = f"picks of other phases than P and S are left out: {len(other)} ({names}); rename them if they are P or S"
     return picks, (roles.column("time"),), (note,) if other else ()
 
 

@@ -48,7 +48,7 @@ def without_repeats(
         members = np.flatnonzero(group == number).tolist()
         values[members[0]] = _mean([values[i] for i in members], found)
     kept = replace(found, values=Decimals.of(values)).take(first)
-    note = f"{extra} repeated readings were averaged with the first of their message; sigma is not changed"
+    note = f"{extra} repeated readings were averaged with the first of their message; --sigma is not changed"
     return replace(kept, notes=(*found.notes, note))
 
 

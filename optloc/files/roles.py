@@ -43,7 +43,7 @@ GEOJSON = (".geojson", ".json")
 # Properties of a GeoJSON point that may be its name or its height, the most likely first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
-_NO_HEIGHTS = "no heights are given: all stations are assumed at height 0"
+_NO_HEIGHTS = "no heights are given: all stations are assumed at height 0; add a column height"
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,7 +372,7 @@ def _with_names(roles: Roles) -> tuple[Roles, str]:
     if column is None:
         return roles, ""
     kept = {role: name for role, name in roles.by_role.items() if name != column}
-    note = f"the column {column!r} of {roles.table.source} has the names of the stations: no other column fits"
+    note = f"the column {column!r} of {roles.table.source} has the station names; --column name=NAME states another"
     return replace(roles, by_role={**kept, "name": column}), note
 
 
@@ -473,7 +473,11 @@ def _of_geojson(data: Any, source: str) -> ColumnPlaces:
     columns = {"name": np.array(names, dtype=object), "lat_deg": np.array(lat), "lon_deg": np.array(lon)}
     known = [h is not None for h in height]
     columns["height"] = np.array([0.0 if h is None else h for h in height])
-    lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: 0 is assumed"
+    lacking = (
+        ""
+        if all(known)
+        else f"{known.count(False)} of {len(known)} points have no height: 0 is assumed; add their heights"
+    )
     return ColumnPlaces(columns, "geodetic", "m", _NO_HEIGHTS if not any(known) else lacking)
 
 

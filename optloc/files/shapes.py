@@ -298,7 +298,8 @@ def _with_reference(
     # A zero is the difference of the reference to itself for differences of times or lengths alone.
     if name is None or (found.form.kind != "tdoa" and name in found.a.tolist()):
         return hints, ""
-    return replace(hints, reference=name), f"the reference is {name}: it is the only station without a difference"
+    note = f"the reference is {name}, the only station without a difference; --reference states another"
+    return replace(hints, reference=name), note
 
 
 def _second_station(roles: Roles, hints: ColumnHints) -> tuple[str | None, Array]:
@@ -371,7 +372,7 @@ def _without_reference(found: Readings, table: Table) -> Readings:
     if not same.any():
         return found
     names = ", ".join(dict.fromkeys(np.asarray(found.a)[same].tolist()))
-    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}"
+    note = f"zero readings of the reference station {names} to itself are left out: {int(same.sum())}; see --reference"
     return replace(found.take(np.flatnonzero(~same)), notes=(*found.notes, note))
 
 
@@ -394,7 +395,7 @@ def _with_digits(found: Readings, table: Table) -> Readings:
     step = float(np.spacing(np.abs(found.values.floats()).max())) * factor
     if not floats or step < _ROUNDED:
         return found
-    note = f"arrivals are floating-point numbers, rounded to {step:.3g} m at this size; text or integers are more exact"
+    note = f"arrivals are floating-point numbers, rounded to {step:.3g} m here; write text or integers for more digits"
     return replace(found, notes=(*found.notes, note))
 
 

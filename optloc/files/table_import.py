@@ -467,7 +467,10 @@ def unit_for(column: str, form: Form, hints: ColumnHints, values: Decimals, wher
     if unit_in_name is not None:
         return unit_in_name, ""
     if form.quantity == "angle" and bool((np.abs(values.floats()) > _TURN).any()):
-        return "deg", f"{column!r} is in degrees, because some values exceed a full turn in radians"
+        return (
+            "deg",
+            f"{column!r} is in degrees, because some values exceed a full turn in radians; --unit states another",
+        )
     examples = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
     raise InvalidProblem(f"the unit of the column {column!r} is unknown", where, f"state it with --unit {examples}")
 
@@ -523,8 +526,10 @@ def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table
     if is_missing.all():
         raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
     count = int(is_missing.sum())
-    notes = [f"{_cells(count)} with {hints.missing}: no reading"] if count else []
-    notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
+    notes = (
+        [f"{_cells(count)} with {hints.missing}: no reading; use --missing none if they are readings"] if count else []
+    )
+    notes += [f"{_cells(empty)} without a number: no reading; fill in a number that is missing"] if empty else []
     return replace(found.take(np.flatnonzero(~is_missing)) if count else found, notes=(*found.notes, *notes))
 
 

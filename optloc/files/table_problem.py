@@ -24,6 +24,15 @@ from optloc.files.table import Table
 from optloc.files.words import Words
 from optloc.files.writer import write_csv
 
+# Options by the key of a problem file that they become.
+_KEYS = {
+    "sigma": "--sigma",
+    "unit": "--unit",
+    "wind": "--wind",
+    "propagation_speed": "--wave-speed",
+    "two_way": "--turn-around",
+    "turn_around": "--turn-around",
+}
 # Largest number of characters in the name of a temporary file.
 _LETTERS = 40
 
@@ -110,11 +119,29 @@ class TableProblem:
         file = document_of(text, out.name)
         sheets = (self.places.columns, *(section.columns for section in self.sections))
         stations, *tables = (_table(name, columns) for name, columns in zip(names, sheets, strict=True))
-        made = assemble(file, stations, tables, out.name, values=True, more=more)
-        loaded = replace(made, loaded=replace(made.loaded, source=self.source.name)).plausible("table")
+        try:
+            made = assemble(file, stations, tables, out.name, values=True, more=more)
+            loaded = replace(made, loaded=replace(made.loaded, source=self.source.name)).plausible("table")
+        except InvalidProblem as error:
+            raise InvalidProblem(error.what, self._place(error.where, out.name, names), error.advice) from None
         # of S minus P, the report names the speeds of both waves
         speed = loaded.speed if any(word == "wave" for word, _ in self.about) else ""
         return replace(loaded, table=self.as_read, speed=speed)
+
+    def _place(self, where: str | None, file: str, names: Sequence[str]) -> str | None:
+        """Return the place of an error for the user of the table: an option, or the table.
+
+        The problem file `file` and its tables `names` are not on the disk. The rows of a table were rearranged, so its
+        numbers of rows are left out.
+        """
+        if where is None or not where.startswith((file, *names)):
+            return where
+        option = next((option for key, option in _KEYS.items() if where.endswith(f"key '{key}'")), None)
+        if option is not None:
+            return option
+        if where.startswith(names[0]):
+            return where.replace(names[0], f"stations of {self.source.name}", 1)
+        return self.source.name
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file and its tables, and return their paths."""

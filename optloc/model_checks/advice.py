@@ -17,6 +17,7 @@ from optloc.model_checks.geometry import Advice, advise_on_geometry
 from optloc.model_checks.plausibility import CHECKS, suspicious_values
 from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.model_checks.unit_mistakes import advise_on_values
+from optloc.models import MODELS
 from optloc.problem.bias import family
 from optloc.problem.epochs import by_epoch, has_correlated_epochs, separable, some_epochs
 from optloc.problem.fix import Fix
@@ -249,7 +250,10 @@ def _error_advice(problem: Problem, explanation: Explained) -> Advice:
         return Advice("step", seen, "split the run there, or give the later rows another station name")
     if kind == "burst":
         return Advice("burst", seen, "remove these rows, or use the method 'robust'")
-    return Advice(kind, seen, "check this channel; until then, model the error", _lines(problem, explanation))
+    # a factor of all lengths of a kind is a wrong unit or a wrong wave speed
+    lengths = candidate.per == "kind" and kind == "scale" and MODELS[str(candidate.kind)].quantity == "length"
+    where = "the wave speed and the unit" if lengths else "this channel"
+    return Advice(kind, seen, f"check {where}; until then, model the error", _lines(problem, explanation))
 
 
 def _size(problem: Problem, explanation: Explained) -> tuple[str, str]:

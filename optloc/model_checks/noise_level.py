@@ -159,8 +159,8 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
     common = np.array([_lowest_deviance(cost, dof, f).sum() for f in _FACTORS])
     # Instead of the factor of one group, every fix may also exclude measurements. With a single kind, the factor of the
     # kind is the common factor.
-    single = [*_single_groups(by_station, tests, cost, dof)]
-    single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
+    single = [*_single_groups(by_station, tests, cost)]
+    single += [*_single_groups(by_kind, tested(by_kind, np.ones(())), cost)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
     gain = float(stated.sum() - min(common.min(), least))
     if gain <= ROW_PRICE:
@@ -237,12 +237,12 @@ def _lowest_deviance(cost: Array, dof: Array, factor: float) -> Array:
     return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
 
 
-def _single_groups(packed: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
+def _single_groups(packed: Elements, tests: Tested, cost: Array) -> Iterator[tuple[str, float, float]]:
     """Yield for each group its name, the most likely factor of sigma of its errors alone, and the likelihood with it.
 
     The likelihood is given as twice its negative logarithm. `packed` are the linearised fixes, and `tests` the tests
-    with the noise as stated. `cost` and `dof` (N, 1 + k) come from `_exclusion_path`; `dof` is not used. Instead of
-    the factor, a fix may also exclude measurements.
+    with the noise as stated. `cost` (N, 1 + k) comes from `_exclusion_path`. Instead of the factor, a fix may also
+    exclude measurements.
 
     A factor f adds (f^2 - 1) B B' to V, with the columns B of the group. Let l be the eigenvalues of T of `Tested` for
     these columns, and y the components of t along its eigenvectors. The cost decreases by the sum of

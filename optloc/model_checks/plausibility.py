@@ -326,6 +326,7 @@ def _find_size(view: _View) -> Iterator[Advice]:
         if not remote or _linear_p(view.groups, factor) > _FITS:
             fitting.append(words)
     if not fitting:
+        yield from _find_header(view)
         return
     kinds = dict.fromkeys([group.kind for group in view.groups] + ["tdoa"] * bool(len(view.differences.size)))
     seen = f"the {' and '.join(kinds)} values are {' or '.join(text for text, _ in fitting)} for the distances of the"
@@ -334,6 +335,19 @@ def _find_size(view: _View) -> Iterator[Advice]:
     plain = all(view.units.get(kind, 1.0) == 1.0 for kind in kinds)
     example = f", such as {' or '.join(view.words.unit.format(unit) for unit in meant)}" if meant and plain else ""
     yield Advice("size", f"{seen} stations", f"state their unit{example}, or correct the unit of the stations")
+
+
+def _find_header(view: _View) -> Iterator[Advice]:
+    """Yield advice if ranges contradict the stations in their written unit, and fit them as plain metres."""
+    kinds = {group.kind for group in view.groups}
+    # Differences of arrivals fit in any unit that makes them small. Ranges must also be long enough.
+    if len(kinds) != 1 or view.groups[0].emission or len(view.differences.size):
+        return
+    (kind,) = kinds
+    size = view.units.get(kind, 0.0)
+    if size not in (0.0, 1.0) and max(_contradictions(view, 1.0 / size)) <= _RARE:
+        seen = f"the {kind} values contradict the stations in their unit, and fit them as metres"
+        yield Advice("size", seen, f"state their unit, such as {view.words.unit.format('m')}, or correct the header")
 
 
 def _is_remote(view: _View) -> bool:

@@ -45,3 +45,8 @@ def test_no_solution_without_a_fix():
 def test_nearest_ignores_case_and_lists_all():
     assert nearest("KM", ["m", "km", "nmi"]).startswith("did you mean 'km'")
     assert nearest("bogus", ["m", "km"]) == "known are m, km"
+
+
+def test_a_message_that_ends_with_a_question_has_no_full_stop():
+    assert str(InvalidProblem("there is no such file", "a.csv", "did you mean 'b.csv'?")).endswith("'b.csv'?")
+    assert str(InvalidProblem("there is no such file", "a.csv", "check the name")).endswith("name.")

@@ -1,5 +1,7 @@
 """Speeds of sound against published tables."""
 
+import math
+
 import pytest
 
 from optloc import InvalidProblem
@@ -27,6 +29,39 @@ DRY = [
 ]  # fmt: skip
 # V. A. Del Grosso and C. W. Mader, J. Acoust. Soc. Am. 52 (1972): pure water at one atmosphere, temperature and m/s.
 PURE = [(0, 1402.388), (10, 1447.270), (20, 1482.343), (25, 1496.687), (30, 1509.127), (40, 1528.863)]
+
+
+# Dry air: share, molar mass (g/mol), and heat capacity (J/mol K) of the ideal gas at 200 K and 298.15 K. The heat
+# capacities are of M. W. Chase, NIST-JANAF Thermochemical Tables (1998).
+GASES = {
+    "N2": (0.78084, 28.0134, 29.107, 29.124),
+    "O2": (0.20946, 31.9988, 29.126, 29.376),
+    "Ar": (0.00934, 39.948, 20.786, 20.786),
+}
+CARBON_DIOXIDE, WATER = (44.0095, 32.359, 37.129), (18.01528, 33.349, 33.590)
+MOLAR_GAS, ATMOSPHERE = 8.314462618, 101_325.0
+
+
+def humid(celsius: float, humidity: float, gas: float) -> float:
+    """Return the speed of sound in humid air at one atmosphere, m/s, from properties of its gases.
+
+    The speed of a real gas is c^2 = gamma R T / M (1 + 2 p K / (R T)), K = B + (gamma - 1) T B' + (gamma - 1)^2 / (2
+    gamma) T^2 B'': J. O. Hirschfelder and others, "Molecular Theory of Gases and Liquids" (1954). The second
+    virial coefficient B is of the compressibility of the CIPM (R. S. Davis, Metrologia 29, 1992), and the saturated
+    vapour of ISO 9613-1 (1993), annex B. None of these formulas has a coefficient of Cramer's speed.
+    """
+    kelvin, t, p = celsius + 273.15, celsius, ATMOSPHERE
+    x = humidity / 100.0 * 10.0 ** (4.6151 - 6.8346 * (273.16 / kelvin) ** 1.261)
+    dry = (1.0 - x - gas) / sum(share for share, *_ in GASES.values())
+    parts = [(dry * share, *more) for share, *more in GASES.values()] + [(gas, *CARBON_DIOXIDE), (x, *WATER)]
+    mass = 1e-3 * sum(share * molar for share, molar, *_ in parts)
+    capacity = sum(share * (low + (high - low) * (kelvin - 200.0) / 98.15) for share, _, low, high in parts)
+    gamma = capacity / (capacity - MOLAR_GAS)
+    virial = 1.58123e-6 - 2.9331e-8 * t + 1.1043e-10 * t**2 + (5.707e-6 - 2.051e-8 * t) * x
+    virial += (1.9898e-4 - 2.376e-6 * t) * x**2
+    slope, bend = -2.9331e-8 + 2.2086e-10 * t - 2.051e-8 * x - 2.376e-6 * x**2, 2.2086e-10
+    k = virial + (gamma - 1.0) * kelvin * slope + (gamma - 1.0) ** 2 / (2.0 * gamma) * kelvin**2 * bend
+    return math.sqrt(gamma * MOLAR_GAS * kelvin / mass * (1.0 - 2.0 * p * k / kelvin))
 
 
 def pressed(decibars: float) -> float:
@@ -58,6 +93,13 @@ def test_the_pressure_agrees_with_the_depth_of_saunders():
 def test_humid_air_agrees_with_cramer():
     for celsius, humidity, speed in AIR:
         assert sound_in_air(celsius, humidity, 314e-6) == pytest.approx(speed, abs=0.1)
+
+
+@pytest.mark.parametrize("celsius", [0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0])
+def test_humid_air_agrees_with_the_properties_of_its_gases(celsius):
+    for humidity in (0.0, 25.0, 50.0, 75.0, 100.0):
+        for gas in (314e-6, 400e-6, 1e-3):
+            assert sound_in_air(celsius, humidity, gas) == pytest.approx(humid(celsius, humidity, gas), abs=0.06)
 
 
 def test_dry_air_agrees_with_its_table():

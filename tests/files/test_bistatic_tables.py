@@ -69,7 +69,7 @@ def differences(first="0"):
 def test_zero_rows_of_the_reference_station_are_left_out_with_a_note(tmp_path):
     hints = ColumnHints(tmp_path / "st.csv", "1 m", reference="R1")
     found = interpret_table(written(tmp_path, differences()), hints)
-    assert "zero readings of the reference station R1 to itself are left out: 1" in found.notes
+    assert "zero readings of the reference station R1 to itself are left out: 1; see --reference" in found.notes
     assert optloc.solve(found.read().problem).position == pytest.approx(TARGET, abs=0.1)
     with pytest.raises(InvalidProblem, match="tdoa names station 'R1' twice; name two stations"):
         interpret_table(written(tmp_path, differences("3.5")), hints)
@@ -80,7 +80,7 @@ def test_a_column_of_the_reference_in_a_wide_table_is_left_out(tmp_path):
     cells = ",".join(f"{value - at['R1']:.3f}" for value in at.values())
     path = written(tmp_path, ",".join(f"{name}_tdoa_m" for name in at) + f"\n{cells}\n{cells}\n")
     found = interpret_table(path, ColumnHints(tmp_path / "st.csv", "1 m", reference="R1"))
-    assert "zero readings of the reference station R1 to itself are left out: 2" in found.notes
+    assert "zero readings of the reference station R1 to itself are left out: 2; see --reference" in found.notes
 
 
 def test_results_are_also_in_the_unit_of_the_stations(tmp_path):

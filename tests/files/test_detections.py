@@ -58,7 +58,9 @@ def test_events_without_delays_are_left_out_with_a_note(tmp_path):
     table = events("lists").astype({"tdoas": object})
     table.at[0, "tdoas"] = None
     table.to_csv(tmp_path / "events.csv")
-    assert read_table(tmp_path / "events.csv").notes == ("events without delays are left out: 1",)
+    assert read_table(tmp_path / "events.csv").notes == (
+        "events without delays are left out: 1; add their delays to use them",
+    )
     table["tdoas"] = None
     table.to_csv(tmp_path / "events.csv")
     with pytest.raises(InvalidProblem, match="no event has delays; run estimate_location of opensoundscape"):

@@ -52,9 +52,9 @@ def test_recorders_and_delays_need_no_column_and_no_reference(tmp_path):
     assert problem.z.tolist() == same.z.tolist()
     assert [*found.sections[0].columns["b"]] == [FILES[0]] * 5
     assert found.notes[:3] == (
-        "the column 'file' has the station of each row: no other column fits",
-        "the column 'file' of s.csv has the names of the stations: no other column fits",
-        f"the reference is {FILES[0]}: it is the only station without a difference",
+        "the column 'file' has the station of each row; --column station=NAME states another",
+        "the column 'file' of s.csv has the station names; --column name=NAME states another",
+        f"the reference is {FILES[0]}, the only station without a difference; --reference states another",
     )
     assert not any("column" in note or "reference" in note for note in stated.notes)
 

@@ -110,3 +110,25 @@ def test_a_live_site_refuses_a_negative_range_and_warns_once(folder, caplog):
             engine.settle([Event(str(number), rows, {}, 0.0, 0.0, closed="whole")])
     assert "the range at C is -3 m, and no distance is negative" in answers[-1]["error"]
     assert sum("100 times too large" in one.message for one in caplog.records) == 1
+
+
+def test_a_column_sigma_that_replaces_the_key_is_named(folder):
+    rows = "\n".join(f"{name},{value:.4f},0.03" for name, value in RANGES.items())
+    (folder / "r.csv").write_text(f"anchor,range_m,sigma\n{rows}\n")
+    assert read(site(folder)).warnings == ("the column sigma of r.csv replaces the key sigma; remove one of them",)
+    path = site(folder)
+    path.write_text(path.read_text().replace("sigma = 0.03\n", ""))
+    assert read(path).warnings == ()
+
+
+def test_a_header_that_contradicts_ranges_is_reported(folder):
+    write(folder, 1.0, "range_s")
+    output = fix().output
+    assert "the range values contradict the stations in their unit, and fit them as metres" in output
+    assert "--unit m" in output
+
+
+def test_an_option_that_replaces_a_column_sigma_is_named(folder):
+    rows = "\n".join(f"{name},{value:.4f},0.03" for name, value in RANGES.items())
+    (folder / "r.csv").write_text(f"anchor,range_m,sigma_m\n{rows}\n")
+    assert "--sigma replaces the column sigma_m; remove one of them." in fix().output

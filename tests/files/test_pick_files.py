@@ -85,7 +85,7 @@ def test_hypo71_phase_cards(tmp_path):
     assert fix.status.label == "ok"
     assert error < 100.0
     table = read_table(tmp_path / "event.pha")
-    assert table.notes[0] == "picks with weight 4 are left out: 1"
+    assert table.notes[0] == "picks with weight 4 are left out: 1; change their weight to use them"
     assert "picks have weights 1 to 3, which are 3/4, 1/2 and 1/4 of full weight" in table.notes[1]
 
 
@@ -153,7 +153,9 @@ def test_picks_of_obspy_without_phase_are_left_out(tmp_path, monkeypatch):
     (tmp_path / "event.xml").write_text(quakeml())
     table = read_table(tmp_path / "event.xml")
     assert table.labels("station").tolist() == ["AQU"]
-    assert table.notes == ("picks that are rejected, or without phase or station, are left out: 1",)
+    assert table.notes == (
+        "picks that are rejected, or without phase or station, are left out: 1; complete them to use them",
+    )
 
 
 @pytest.mark.parametrize("make", [hypo71, nonlinloc, quakeml])

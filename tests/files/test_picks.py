@@ -59,11 +59,9 @@ def test_nine_p_and_four_s_through_layers(vinti):
     fix = solved(vinti, vp=str(vinti.parent / "crust.csv"), sigma="0.2 s")
     assert fix.latlon[:2] == pytest.approx([43.765, 7.553], abs=1e-3)
     assert fix.latlon[2] == pytest.approx(-7.7e3, abs=150.0)
-    notes = interpret_table(
-        vinti, ColumnHints(vinti.parent / "net.csv", "0.2 s", vp=str(vinti.parent / "crust.csv"))
-    ).notes
-    assert not any("left out" in note for note in notes)
-    assert any("vp / vs = 1.68" in note for note in notes)
+    found = interpret_table(vinti, ColumnHints(vinti.parent / "net.csv", "0.2 s", vp=str(vinti.parent / "crust.csv")))
+    assert not any("left out" in note for note in found.notes)
+    assert "vp / vs = 1.68" in dict(found.about)["waves"]
 
 
 @pytest.mark.slow
@@ -113,7 +111,7 @@ def test_other_phases_are_left_out_with_a_note(tmp_path):
     path = written(tmp_path)
     path.write_text(path.read_text() + "AQU,Lg,2024-04-06T01:32:50Z\nAQU,SKS,2024-04-06T01:32:52Z\n")
     found = interpret_table(path, ColumnHints(tmp_path / "net.csv", "0.1 s", vp="5.6 km/s", vs="3.2 km/s"))
-    assert "picks of other phases than P and S are left out: 2 (Lg, SKS)" in found.notes
+    assert "picks of other phases than P and S are left out: 2 (Lg, SKS); rename them if they are P or S" in found.notes
 
 
 def test_p_alone_needs_no_speed_of_s(tmp_path):
@@ -128,7 +126,7 @@ def test_s_minus_p_alone_is_a_choice(tmp_path):
         written(tmp_path), ColumnHints(tmp_path / "net.csv", "0.1 s", "sp", vp="5.6 km/s", vs="3.2 km/s")
     )
     assert [section.kind for section in found.sections] == ["range"]
-    assert "4 stations without both P and S are left out" in found.notes
+    assert "4 stations without both P and S are left out; remove --as sp to use them" in found.notes
 
 
 def test_the_written_file_gives_the_same_fix(tmp_path):
@@ -178,3 +176,13 @@ def test_every_mistake_is_one_sentence(text, options, words, tmp_path):
 def test_load_table_names_an_unknown_option(tmp_path):
     with pytest.raises(InvalidProblem, match="there is no option 'sgma'; did you mean 'sigma'"):
         load_table(written(tmp_path), sgma="0.1 s")
+
+
+def test_speeds_of_p_and_s_without_picks_are_refused(tmp_path):
+    (tmp_path / "s.csv").write_text("name,x_m,y_m\nA,0,0\nB,900,0\nC,0,900\nD,900,1000\n")
+    (tmp_path / "t.csv").write_text("station,toa_ms\nA,10\nB,20\nC,25\nD,30\n")
+    hints = {"stations": tmp_path / "s.csv", "sigma": "1 ms"}
+    with pytest.raises(InvalidProblem, match="--vp: the table has no picks of P and S"):
+        interpret_table(tmp_path / "t.csv", ColumnHints(**hints, vp="5 km/s"))
+    with pytest.raises(InvalidProblem, match="--unit: 'deg' is not a unit of"):
+        interpret_table(tmp_path / "t.csv", ColumnHints(**hints, unit="deg"))

@@ -44,3 +44,17 @@ def test_a_table_without_sigma_is_told_how_to_say_it():
     error = no_sigma("2 deg", "azimuth")
     assert "azimuth" in error.what
     assert "--sigma '2 deg'" in error.advice
+
+
+def test_errors_name_an_option_or_the_table_and_no_file_that_is_not_written():
+    problem = made(Path("t.csv"))
+    names = ["t-stations.csv", "t-rows.csv"]
+    places = {
+        "t.toml, [[measurements]] 1, key 'sigma'": "--sigma",
+        "t.toml, key 'wind'": "--wind",
+        "t.toml, [[measurements]] 1": "t.csv",
+        "t-rows.csv, row 3": "t.csv",
+        "t-stations.csv, row 1": "stations of t.csv, row 1",
+        "--height, key 'exactly'": "--height, key 'exactly'",
+    }
+    assert {place: problem._place(place, "t.toml", names) for place in places} == places

@@ -25,7 +25,8 @@ from optloc.problem import ANSWERED, Amount, Array, InvalidProblem, Status
 from optloc.sites.calibration.calibrated import Calibration, calibrate
 from optloc.sites.calibration.gauge import determined
 from optloc.sites.calibration.likelihood import NetworkEstimate, likelihood, together
-from optloc.sites.calibration.network import Network, network_of
+from optloc.sites.calibration.network import Network
+from optloc.sites.calibration.network_arguments import network_of
 
 CALIBRATE = "calibrate"
 """Name of the method of optloc for networks."""

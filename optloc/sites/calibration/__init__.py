@@ -1,7 +1,8 @@
 """Self-calibration of networks: unknown stations, clocks and emitters are estimated together."""
 
 from optloc.sites.calibration.calibrated import Alternative, Calibration, calibrate
-from optloc.sites.calibration.network import Network, NetworkSlot, network_of
+from optloc.sites.calibration.network import Network, NetworkSlot
+from optloc.sites.calibration.network_arguments import network_of
 from optloc.sites.calibration.posed_network import PosedNetwork, RelaxedNetwork, pose_network
 
 __all__ = [

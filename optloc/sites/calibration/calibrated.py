@@ -15,11 +15,9 @@ from functools import partial
 
 import numpy as np
 
-from optloc.engine import STRAIGHT
 from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, no_station, tail_probability
 from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
-    GaugeRank,
     departure,
     determined,
     fixed_by,
@@ -29,19 +27,17 @@ from optloc.sites.calibration.gauge import (
     with_mean_clock,
 )
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
-from optloc.sites.calibration.multi_start import AGREEING, NetworkSearchResult, frame_size, proven, search
+from optloc.sites.calibration.multi_start import NetworkSearchResult, frame_size, proven, search
 from optloc.sites.calibration.network import Network
+from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, NetworkFacts, shorten
 from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.restarts import laid
-from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, Finding, objections
+from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, objections
 
 # Pulses in the search, those with the most rows: more pulses did not find other networks.
 _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
-# Largest share of pulses with two possible positions. More of them have many combinations of sides, and the cheapest
-# combination can give a wrong shape of the stations. At 3 cm noise, flat stations appear 0.1 to 0.3 m thick.
-_TWOFOLD = 0.5
 # Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
 # Two networks are one result if their difference has at least this probability under the covariance.
@@ -231,12 +227,18 @@ def calibrate(
         return _calibrate_robust(network, gauge, seed, starts, tell)
     enough = _placeable(network)  # mask (N,) of pulses
     if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
-        return _failure(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
+        return _failure(
+            network,
+            Status.TOO_FEW_ROWS,
+            "There are fewer measurements than unknowns; add pulses, distances or known positions.",
+        )
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])  # pulses with the most rows
     core = core[enough[core]]
     found = search(network.take(core), seed, starts, tell)
     if found is None:
-        return _failure(network, Status.NUMERICAL, "No start converged to a network.")
+        return _failure(
+            network, Status.NUMERICAL, "No start converged to a network; check the unit and the sigma of the values."
+        )
     at = found.best
     rest = enough.copy()
     rest[core] = False
@@ -266,7 +268,7 @@ def _calibrate_robust(
     if not len(left):
         return found
     names = [f"{network.names[network.slots[r].a]} of pulse {network.labels[j]}" for j, r in left]
-    words = f"These rows were left out as gross errors, without a proof: {_shorten(names)}."
+    words = f"These rows were left out as gross errors, without a proof: {shorten(names)}; check them by hand."
     status = min(found.status, Status.UNPROVEN, key=PRECEDENCE.index) if found.status in PRECEDENCE else found.status
     return replace(found, network=network, status=status, findings=(*found.findings, words), left_out=left)
 
@@ -317,8 +319,11 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
         pulses[_moved_pulses(at, other)] = np.nan
     elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
-    facts = _Facts(net, found, rank, p, tuple(sides), departs, checked, elsewhere, np.isnan(pulses).any(axis=1))
-    findings = objections(_FINDINGS, facts)
+    others_named = tuple((other.what, other.gap) for other in elsewhere)
+    facts = NetworkFacts(
+        net, found, rank, p, tuple(sides), departs, checked, others_named, np.isnan(pulses).any(axis=1)
+    )
+    findings = objections(NETWORK_FINDINGS, facts)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
         net,
@@ -339,117 +344,6 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
         alternatives,
         np.where(net.given, lik.residual(at)[0], np.nan),
     )
-
-
-def _open_words(net: Network, rank: GaugeRank) -> str:
-    """Return a sentence about motions that the measurements do not determine, with the stations that move most."""
-    m, d = net.stations, net.dimension
-    share = np.sqrt((rank.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
-    if not net.synchronised:
-        share = np.hypot(share, np.sqrt((rank.open[m * d :] ** 2).sum(axis=1)))
-    largest = [net.names[i] for i in np.argsort(-share, kind="stable")[:3]]
-    count = rank.open.shape[1]
-    return (
-        f"The measurements do not determine {count} motion{'s' if count > 1 else ''} of the network, mostly of "
-        f"{', '.join(largest)}; add pulses outside their plane, distances between stations, or known positions."
-    )
-
-
-def _curved_words(far: float) -> str:
-    """Return a sentence about a covariance that is not valid; `far` is the result of `departure`."""
-    words = f"three standard deviations away, the rise of the cost differs by a factor of up to {np.exp(far):.2g}"
-    return f"The covariance does not cover the error: {words}."
-
-
-@dataclass(frozen=True, slots=True)
-class _Facts:
-    """The quantities that decide the status of a network.
-
-    Parameters
-    ----------
-    net, found, motions : Network, NetworkSearchResult, GaugeRank
-        The network, its search, and its determined and open motions.
-    p : float
-        Probability of residuals at least as large (chi-square).
-    sides : tuple of str
-        Sentences about stations, or pulses, in one plane.
-    departure : float
-        See `optloc.sites.calibration.gauge.departure`; NaN if a motion is open.
-    blocks : tuple of StationBlock
-        Stations and pulses with their proofs.
-    elsewhere : tuple of Alternative
-        Networks with other stations that fit about equally well.
-    twofold : bool array (N,)
-        Pulses without a unique position.
-    """
-
-    net: Network
-    found: NetworkSearchResult
-    motions: GaugeRank
-    p: float
-    sides: tuple[str, ...]
-    departure: float
-    blocks: tuple[StationBlock, ...]
-    elsewhere: tuple[Alternative, ...]
-    twofold: Array
-
-    @property
-    def refuted(self) -> list[str]:
-        """Return the names of blocks that have a lower cost at another position."""
-        return [block.name for block in self.blocks if block.refuted]
-
-    @property
-    def unproven(self) -> list[str]:
-        """Return the names of blocks without a proof; for a pulse, another position may have the same cost."""
-        return [block.name for block in self.blocks if not (block.proven if block.station else block.cheapest)]
-
-
-_FINDINGS = (
-    Finding(Status.SINGULAR_GEOMETRY, lambda e: e.motions.open.shape[1], lambda e: [_open_words(e.net, e.motions)]),
-    Finding(Status.AMBIGUOUS, lambda e: e.sides, lambda e: e.sides),
-    Finding(Status.CURVED, lambda e: e.departure > STRAIGHT, lambda e: [_curved_words(e.departure)]),
-    Finding(
-        Status.MISFIT,
-        lambda e: e.p < P_MISFIT,
-        lambda e: [f"The residuals are larger than the stated noise allows: p = {e.p:.2g}."],
-    ),
-    Finding(
-        Status.AMBIGUOUS,
-        lambda e: e.elsewhere,
-        lambda e: [
-            f"Another network fits the data: {other.what[0].lower()}{other.what[1:]}, cost + {other.gap:.2g}."
-            for other in e.elsewhere
-        ],
-    ),
-    Finding(
-        Status.AMBIGUOUS,
-        lambda e: e.twofold.mean() > _TWOFOLD,
-        lambda e: [
-            f"{e.twofold.sum()} of {len(e.twofold)} pulses have no unique position: the stations may be near one plane."
-        ],
-    ),
-    Finding(
-        Status.UNPROVEN,
-        lambda e: e.refuted,
-        lambda e: [f"With all others fixed, another position costs less: {_shorten(e.refuted)}."],
-    ),
-    Finding(
-        Status.UNPROVEN,
-        lambda e: e.unproven and not e.refuted,
-        lambda e: [f"A proof that no other position fits equally well is missing for {_shorten(e.unproven)}."],
-    ),
-    Finding(
-        Status.SEARCHED,
-        lambda e: e.found.agreeing < AGREEING,
-        lambda e: [f"Only {e.found.agreeing} of {e.found.made} starts reached this network; {AGREEING} must agree."],
-    ),
-)
-"""Findings of a network: status, condition and sentences; the first that applies sets the status."""
-
-
-def _shorten(names: list[str]) -> str:
-    """Return at most three names as text, then the number of others."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def refuted_blocks(network: Network, at: NetworkEstimate) -> tuple[StationBlock, ...]:

@@ -281,7 +281,8 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
     places = covariance[: m * d, : m * d].reshape(m, d, m, d)
     if _in_one_plane(at.stations[0], lambda normal: np.einsum("c,icje,e->ij", normal, places, normal)):
         out.append(
-            "The stations are in one plane within their errors: the data do not show on which side the pulses are."
+            "The stations are in one plane within their errors: the data do not show on which side the pulses are; "
+            "add a station off it."
         )
     placed = np.flatnonzero(net.given.sum(axis=1) > d)
     pulses = at.pulses[0, placed]
@@ -289,7 +290,8 @@ def flat(lik: Likelihood, at: NetworkEstimate, covariance: Array) -> list[str]:
         pulses, lambda normal: _height_covariance(lik, at, covariance, placed, normal)
     ) and _may_be_mirrored(net, at.stations[0], pulses):
         out.append(
-            "The pulses are in one plane within their errors: the data do not show on which side the stations are."
+            "The pulses are in one plane within their errors: the data do not show on which side the stations are; "
+            "add a pulse off it."
         )
     return out
 

@@ -22,6 +22,7 @@ from optloc.files import (
     claim,
     distinct,
     ends_of,
+    is_time,
     join,
     name_of,
     parse_toml,
@@ -39,6 +40,7 @@ from optloc.models import MODELS, kind_named
 from optloc.problem import Amount, Array, InvalidProblem, nearest
 from optloc.sites.calibration.calibrated import Calibration
 from optloc.sites.calibration.network import KINDS, Network, NetworkSlot, checked, network_speed
+from optloc.sites.calibration.network_checks import refuse_negative, require_speed, suspicious_network
 
 # Smallest standard deviation of stations in the output file, metres: as good as exact.
 _EXACT = 1e-6
@@ -99,7 +101,14 @@ class NetworkFile(_NetworkTable):
 def read_network(
     path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
 ) -> Network:
-    """Return the network of a file.
+    """Return the network of a file; see `load_network`."""
+    return load_network(path, wave_speed, two_way=two_way, turn_around=turn_around)[0]
+
+
+def load_network(
+    path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
+) -> tuple[Network, tuple[str, ...]]:
+    """Return the network of a file, and sentences about values that are physically suspicious.
 
     Parameters
     ----------
@@ -131,33 +140,19 @@ def read_network(
     )
     names = tuple(str(name) for name in table.labels("name"))
     place, place_sigma = _prior_places(file.stations, table, where)
-    _check_ways(file, two_way=two_way, turn_around=turn_around)
-    rows: list[tuple[str, Array, Array, Array, Array, Array]] = []
-    apart: list[tuple[Array, Array, Array, Array]] = []
-    for i, section in enumerate(file.measurements):
-        place_of = join(source, f"[[measurements]] {i + 1}")
-        rows_table = table_of(section, folder, place_of)
-        if section.kind != BETWEEN and not rows_table.has("epoch"):
-            advice = "add a column epoch; for known stations, use optloc fix"
-            raise InvalidProblem("the rows have no column epoch for the pulse", rows_table.source, advice)
-        between = section.kind == BETWEEN
-        kind = BETWEEN if between else kind_named(section.kind, place_of)
-        if not between and kind not in KINDS:
-            raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
-        ways = _ways(section, kind, place_of, two_way=two_way, turn_around=turn_around)
-        settings = MeasurementsTable(sigma=section.sigma, two_way=ways[0], turn_around=ways[1])
-        read = Context(settings, rows_table, names, place_of, speed, values=True)
-        z, sigma = _values_and_sigmas(read, section.unit)
-        a, b = ends_of(read, kind, 2 if between else MODELS[kind].stations)
-        if between:
-            apart.append((a, b, z, sigma))
-        else:
-            rows.append((kind, rows_table.labels("epoch"), a, b, z, sigma))
+    if (two_way or turn_around is not None) and all(section.kind != "range" for section in file.measurements):
+        option = "--two-way" if two_way else "--turn-around"
+        raise InvalidProblem("the file has no ranges", option, "remove this option")
+    read = [
+        _section_rows(section, i, folder, source, names, speed, (two_way, turn_around))
+        for i, section in enumerate(file.measurements)
+    ]
+    rows, apart = ([one for one in read if (one[0] == BETWEEN) is between] for between in (False, True))
     if not rows:
         raise InvalidProblem("the file has no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
     labels, slots, table_z, table_sigma = _tables_by_pulse(rows)
-    ends = np.array([[a, b] for one in apart for a, b in zip(one[0], one[1], strict=True)], dtype=np.int64)
-    return checked(
+    ends = np.array([[a, b] for one in apart for a, b in zip(one[2], one[3], strict=True)], dtype=np.int64)
+    network = checked(
         Network(
             names,
             slots,
@@ -167,11 +162,56 @@ def read_network(
             place_sigma,
             file.stations.synchronised,
             ends.reshape(-1, 2),
-            np.concatenate([np.zeros(0), *(one[2] for one in apart)]),
-            np.concatenate([np.zeros(0), *(one[3] for one in apart)]),
+            np.concatenate([np.zeros(0), *(one[4] for one in apart)]),
+            np.concatenate([np.zeros(0), *(one[5] for one in apart)]),
             labels,
         )
     )
+    factors = {one.kind: Units("length", speed).conversion(one.unit, source).factor for one in file.measurements}
+    if (
+        given is None
+        and wave_speed is None
+        and any(is_time(Units("length"), s.unit, source) for s in file.measurements)
+    ):
+        require_speed(network, source, '--wave-speed air:20C or propagation_speed = "air:20C"')
+    return network, suspicious_network(network, factors, speed)
+
+
+_Rows = tuple[str, Array, Array, Array, Array, Array]
+"""Rows of a section: kind, pulses, stations a and b (-1 without), values and standard deviations, metres."""
+
+
+def _section_rows(
+    section: NetworkRows,
+    number: int,
+    folder: Path,
+    source: str,
+    names: tuple[str, ...],
+    speed: float,
+    options: tuple[bool, str | None],
+) -> _Rows:
+    """Return the rows of the section with this number; raise InvalidProblem for wrong rows, such as negative ranges.
+
+    `options` are the options on two-way times: whether ranges are such times, and their turn-around time.
+    """
+    place_of = join(source, f"[[measurements]] {number + 1}")
+    table = table_of(section, folder, place_of)
+    between = section.kind == BETWEEN
+    if not between and not table.has("epoch"):
+        advice = "add a column epoch; for known stations, use optloc fix"
+        raise InvalidProblem("the rows have no column epoch for the pulse", table.source, advice)
+    kind = BETWEEN if between else kind_named(section.kind, place_of)
+    if not between and kind not in KINDS:
+        raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
+    ways = _ways(section, kind, place_of, two_way=options[0], turn_around=options[1])
+    settings = MeasurementsTable(sigma=section.sigma, two_way=ways[0], turn_around=ways[1])
+    read = Context(settings, table, names, place_of, speed, values=True)
+    z, sigma = _values_and_sigmas(read, section.unit)
+    a, b = ends_of(read, kind, 2 if between else MODELS[kind].stations)
+    if kind in ("range", BETWEEN):
+        ends = [f"from {names[i]} to {names[j]}" if between else f"at {names[i]}" for i, j in zip(a, b, strict=True)]
+        refuse_negative(z, sigma, ends.__getitem__, lambda i: table.where("z", i), "remove the row")
+    return kind, table.labels("epoch") if not between else np.zeros(len(z), dtype=object), a, b, z, sigma
 
 
 def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
@@ -198,13 +238,6 @@ def _prior_places(section: NetworkStations, table: Table, where: str) -> tuple[A
 def _optional_column(table: Table, key: str) -> Array:
     """Return a column as numbers (q,), NaN where a cell or the column is missing."""
     return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
-
-
-def _check_ways(file: NetworkFile, *, two_way: bool, turn_around: str | None) -> None:
-    """Raise InvalidProblem for options of two-way times if the file has no ranges."""
-    if (two_way or turn_around is not None) and all(section.kind != "range" for section in file.measurements):
-        option = "--two-way" if two_way else "--turn-around"
-        raise InvalidProblem("the file has no ranges", option, "remove this option")
 
 
 def _ways(
@@ -243,7 +276,7 @@ def _values_and_sigmas(read: Context, name: str) -> tuple[Array, Array]:
 
 
 def _tables_by_pulse(
-    rows: list[tuple[str, Array, Array, Array, Array, Array]],
+    rows: list[_Rows],
 ) -> tuple[tuple[str, ...], tuple[NetworkSlot, ...], Array, Array]:
     """Return labels (N) of pulses, slots (R), and tables (N, R) of values and standard deviations, metres.
 

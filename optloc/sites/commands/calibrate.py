@@ -76,13 +76,16 @@ def _run(
     from optloc.cli import Screen, claim_outputs, dumps, line, say, write_picture, write_text
     from optloc.problem import Status
     from optloc.sites.calibration import calibrate as find
-    from optloc.sites.calibration.network_file import check_name, read_network, write_calibrated
+    from optloc.sites.calibration.network_file import check_name, load_network, write_calibrated
 
     out, plot = outputs
     claim_outputs(out, picture=plot, inputs=[file])
     if out is not None:
         check_name(out)
-    network = read_network(file, wave[0], two_way=wave[1], turn_around=wave[2])
+    network, warnings = load_network(file, wave[0], two_way=wave[1], turn_around=wave[2])
+    if not quiet and not as_json:
+        for sentence in warnings:
+            say(Screen(), f"Warning: {sentence}.")
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
     with line(quiet or as_json) as tell:
         tell("searching")
@@ -92,7 +95,7 @@ def _run(
     if plot is not None:
         write_picture(_picture(found, file.stem), plot)
     if as_json:
-        write_text(Path("-"), dumps(_record(found, file)))
+        write_text(Path("-"), dumps(_record(found, file) | {"warnings": warnings}))
     elif not quiet:
         _show(found)
         if out is not None:
