@@ -84,7 +84,7 @@ def test_many_poses_equal_the_method_of_their_name(formulation):
 # one problem of each kind that was wrong: its dual, its tolerance, its unit, or a solver that stopped early
 @pytest.mark.parametrize(
     ("formulation", "seed"),
-    [("minimax_cone", 1244), ("lifted", 1169), ("lifted", 1060), ("squared_range_conic: hull", 3082)],
+    [("minimax_cone", 1244), ("lifted", 1169), ("lifted", 1060), ("lifted", 3316), ("squared_range_conic: hull", 3082)],
 )
 def test_duals_that_were_wrong(formulation, seed):
     assert failures([record(formulation, seed)]) == []
