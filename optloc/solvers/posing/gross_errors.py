@@ -29,12 +29,14 @@ def pose_sparse(problem: Problem, locate: Locate) -> ConicStatement:
     arrived = as_arrivals(alone)
     alone = alone if arrived is None else arrived.problem
     position, failed = lift_positions(alone, lambda part: locate(part).position)
+    if failed[0]:
+        raise InvalidProblem("the solver found no point at which the rows are linear", "formulation", 'use "nls"')
     x = vectors(alone, position[:, None])[:, 0]
     residual, jacobian = derivatives(alone, x)
     sigma = deviations(alone)
     white, right = jacobian[0] / sigma[0][:, None], residual[0] / sigma[0]
     used = np.asarray((white != 0.0).any(0))
-    data = None if failed[0] or not used.any() else sparse_program(white[:, used], right)
+    data = None if not used.any() else sparse_program(white[:, used], right)
     if data is None:
         raise InvalidProblem("the rows leave a direction of the position undetermined", "formulation", 'use "nls"')
     program = sparse_problem(*data.structure)

@@ -22,8 +22,8 @@ from optloc.solvers.starts.position import height_sights, spread_of
 # Positions are in the box of moments if their chi-square is at most this far above the chi-square of the fix. So a
 # constraint may move the optimum by four standard deviations. A larger box is less tight.
 _MARGIN = 16.0
-# Fraction of the step to the boundary of the cones that Clarabel takes for moments, whose equalities depend on each
-# other. At its default, 0.99, iterates are so near the boundary that duals are wrong by up to 2e-4.
+# Fraction of the step to the boundary of the cones that Clarabel takes. At its default, 0.99, iterates are so near the
+# boundary that duals of moments, whose equalities depend on each other, are wrong by up to 2e-4.
 _STEP = 0.8
 # Tolerance of the gap of Clarabel for the order-1 lift. For range differences the objective may be 1e-3 of its size. At
 # the tolerance of the baseline, 1e-9, duals are wrong by up to 3e-4.
@@ -158,7 +158,7 @@ def pose_lifted(problem: Problem, locate: Locate) -> ConicStatement:
         residual=rows @ lift[0, 1 + d :] - right,
         read=read,
         rank_ratio=lambda: rank_ratio(lift.value),
-        settings={**settings_of(), "tol_gap_abs": _FINE, "tol_gap_rel": _FINE},
+        settings={**settings_of(), "tol_gap_abs": _FINE, "tol_gap_rel": _FINE, "max_step_fraction": _STEP},
     )
 
 

@@ -6,7 +6,7 @@ from time import monotonic
 import numpy as np
 from solvers.posing.measures import ISOLATED, LEAST, WITHOUT_POSITION, above_least, denied_points, drawn, fenced
 
-from optloc import pose
+from optloc import InvalidProblem, pose
 
 # Limits of residuals and of duals, and of bounds above an independent search.
 KKT, DUAL, ABOVE = 1e-6, 1e-4, 1e-6
@@ -27,7 +27,15 @@ HEADER = [
 
 
 def record(formulation, seed):
-    """Return the measures of one problem as a dictionary of plain numbers."""
+    """Return the measures of one problem as a dictionary of plain numbers; a refusal has no residual."""
+    try:
+        return measures(formulation, seed)
+    except InvalidProblem:
+        return {"seed": seed, "outcome": "refused", "worst": float("nan")}
+
+
+def measures(formulation, seed):
+    """Return the measures of one problem that is posed; see `record`."""
     if formulation in WITHOUT_POSITION:
         posed = pose(drawn(formulation, seed), formulation)
         base, unit = posed.solve(refine=False).posed, posed.unit
