@@ -17,7 +17,7 @@ import numpy as np
 from optloc.engine import numbers
 from optloc.files import Units, positive_speed, stated_speed
 from optloc.models import MODELS, kind_named
-from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, check_once, nearest
+from optloc.problem import SPEED_OF_LIGHT, Amount, Array, HasShortForm, InvalidProblem, check_once, nearest
 
 CLOCKED = ("toa", "tdoa")
 """Kinds that depend on the station clock; a two-way range does not."""
@@ -43,8 +43,8 @@ class NetworkSlot:
     b: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Network:
+@dataclass(frozen=True, slots=True, repr=False)
+class Network(HasShortForm):
     """Measurements between stations and pulses at unknown positions.
 
     Parameters
