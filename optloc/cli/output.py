@@ -76,12 +76,12 @@ def show_sheet(sheet: FixSheet, console: Console, colour: str = "") -> None:
     width = None if sheet.head else 60
     table = Table(title=sheet.title or None, title_justify="left", show_header=bool(sheet.head), min_width=width)
     needed = 1
-    for number_of_column, name in enumerate(sheet.head):
-        cells_of_column = [row[number_of_column] for row in sheet.rows]
-        number = name not in TEXT_COLUMNS
+    for place, name in enumerate(sheet.head):
+        cells_of_column = [row[place] for row in sheet.rows]
+        numeric = name not in TEXT_COLUMNS
         # A number on two lines is misread. So a table that is too wide for the screen continues beyond its edge.
-        least = max(map(len, cells_of_column), default=0) if number else _LEAST
-        table.add_column(name, justify="right" if number else "left", min_width=least)
+        least = max(map(len, cells_of_column), default=0) if numeric else _LEAST
+        table.add_column(name, justify="right" if numeric else "left", min_width=least)
         needed += least + 3
     for number, row in enumerate(sheet.rows):
         cells: list[str | Text] = list(row)
