@@ -13,8 +13,8 @@ from optloc.cli import app
 from optloc.cli.track import differences
 from optloc.problem.build import station_array
 from optloc.problem.epochs import by_epoch, states_by_epoch
+from optloc.show.answer_texts import with_sigma
 from optloc.show.columns import fix_columns
-from optloc.show.fixes import with_sigma
 from optloc.station_health.stations import health
 
 FREE = (optloc.Motion(0, span="epoch"),)

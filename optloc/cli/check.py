@@ -42,8 +42,8 @@ from optloc.problem.epoch_groups import explanations_by_epoch
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.show.answer_texts import with_sigma
 from optloc.show.columns import Columns, records
-from optloc.show.fixes import with_sigma
 from optloc.solvers.methods import Method
 from optloc.station_health.stations import Health, health_of
 

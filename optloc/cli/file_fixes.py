@@ -16,14 +16,19 @@ from optloc.base.types import Status
 from optloc.base.units import UNITS
 from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
+from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
+from optloc.model_checks.geometry import Advice
 from optloc.problem.epoch_groups import EpochGroup, epoch_groups, problem_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.show import columns as tables
+from optloc.show.answer_sheets import MOST_ROWS
 from optloc.show.columns import Columns, fix_detail, level_covariance, records
+from optloc.show.describe_fix import answer_of
+from optloc.show.fix_answer import FixAnswer
 from optloc.show.formats.marks import Results
 from optloc.show.origin_time import origin_columns
 
@@ -279,6 +284,34 @@ def _unnoticed_errors(fix: Fix, found: FileFixes, groups: Sequence[EpochGroup], 
 
     problem = problem_of(groups, item) if found.apart else found.loaded.problem
     return {"unnoticed": reliability_json(reliability_of(problem, fix.x, fix.suspects))}
+
+
+def answer_of_file(found: FileFixes, advice: Sequence[Advice] = (), most: int = MOST_ROWS) -> FixAnswer:
+    """Return the answer of the fixes of a file, with its names of epochs and targets.
+
+    `advice` is the advice on the data, and `most` the number of fixes that tables show completely.
+    """
+    loaded, columns = found.loaded, found.columns
+    fix = found.fix[0] if found.apart and len(columns["x"]) == 1 else found.fix
+    details = [("azimuths", loaded.azimuths)] if loaded.azimuths else []
+    details += [("wave speed", loaded.speed)] if loaded.speed not in ("", NOT_STATED) else []
+    where = []
+    converted = in_unit_of_stations(loaded, columns)
+    if converted and len(columns["x"]) == 1 and np.isfinite(columns["x"]).all():
+        parts = [(*name.split("_", 1), float(values[0])) for name, values in converted.items()]
+        text = ", ".join(f"{axis} = {value:.6g} {unit}" for axis, unit, value in parts)
+        where.append((f"in {loaded.table['unit']}", text))
+    return answer_of(
+        fix,
+        columns,
+        loaded.title,
+        seen=found.seen,
+        unit_of=loaded.bias_unit,
+        where=where,
+        details=details,
+        advice=advice,
+        most=most,
+    )
 
 
 def results_of(found: FileFixes) -> Results:

@@ -10,16 +10,15 @@ from typing import Any, cast
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim, replace_together
-from optloc.base.types import ANSWERED, Array, Status
+from optloc.base.types import Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
+    answer_of_file,
     fix_file,
     fixes_json,
-    in_unit_of_stations,
     results_of,
 )
 from optloc.cli.from_table import read_problem
@@ -29,12 +28,12 @@ from optloc.cli.output import (
     dumps,
     say,
     say_all,
+    show_answer,
     write_picture,
     write_results,
     write_text,
 )
 from optloc.files.constraint_table import ConstraintTable
-from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
@@ -45,19 +44,9 @@ from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, c
 from optloc.model_checks.plausibility import CHECKS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.show.answer_texts import as_p, with_sigma
 from optloc.show.columns import Columns, records
-from optloc.show.fixes import (
-    SHOWN,
-    FixSheet,
-    alternative_sheet,
-    as_p,
-    bias_sheet,
-    count_sheet,
-    fix_sheet,
-    suspect_sheet,
-    whose,
-    with_sigma,
-)
+from optloc.show.fix_answer import advice_lines
 from optloc.show.formats.marks import geojson
 from optloc.solvers.policy import P_MISFIT
 from optloc.station_health.levels import (
@@ -67,11 +56,8 @@ from optloc.station_health.levels import (
 )
 from optloc.station_health.structure import with_estimated_noise
 
-# Largest number of lines of each list on a screen. The remaining lines are counted; --json and --out have all lines.
-_STATES, _FAILURES = SHOWN, 10
-# Columns of text; columns of numbers are aligned to the right.
-_TEXTS = {"name", "member", "estimate", "suspect"}
-_GOOD, _CARE, _BAD = "green", "yellow", "red"
+# Largest number of lines of a list on a screen. The remaining lines are counted; --json and --out have all lines.
+_STATES = 12
 
 
 def run_fix(
@@ -116,13 +102,14 @@ def run_fix(
     if signals is not None and len(signals.late) == len(found.columns["x"]):
         found.columns.update(late_rows=signals.late, on_late_rows=signals.carried)
     levels = found.loaded.levels
-    _write(found, out, geojson_path, plot, html)
-    if quiet and not as_json:
+    # the search for causes takes time, so do it only if the result is read by people
+    silent = quiet and not as_json
+    advice = () if silent and html is None else advice_for_fixes(found)
+    _write(found, out, geojson_path, plot, html, advice)
+    if silent:
         return 0 if found.passes(allow) else 1
-    # the search for causes takes time, so do it only if the result is printed
     level, signals = rescaled or _level_of(found), signals or _late_of(found)
     used = rescaled is not None or bool(np.any(found.fix.has(Status.RESCALED)))
-    advice = advice_for_fixes(found)
     other = _explain(found, method) if explain else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
@@ -132,8 +119,7 @@ def run_fix(
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(advice)} | noise_found))
     else:
         console = Screen(stderr=on_output)
-        show(found, console)
-        show_advice(advice, console)
+        show(found, console, advice)
         if explain:
             _show_explained(found, other, console)
         if level is not None or signals is not None:
@@ -143,8 +129,15 @@ def run_fix(
     return 0 if found.passes(allow) else 1
 
 
-def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: Path | None, html: Path | None) -> None:
-    """Write the requested files: all of them, or none if one fails."""
+def _write(
+    found: FileFixes,
+    out: Path | None,
+    geojson_path: Path | None,
+    plot: Path | None,
+    html: Path | None,
+    advice: tuple[Advice, ...],
+) -> None:
+    """Write the requested files: all of them, or none if one fails; `advice` is part of the page `html`."""
     with replace_together():
         if out is not None:
             write_results(out, results_of(found))
@@ -153,10 +146,11 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
         if plot is not None:
             draw(found, plot)
         if html is not None:
-            from optloc.show.page import fix_page
+            from optloc.show.page import LISTED, fix_page
 
             labels = [str(label) for label in found.columns["epoch"]]
-            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels))
+            answer = answer_of_file(found, advice, LISTED)
+            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, answer))
 
 
 def draw(found: FileFixes, path: Path) -> None:
@@ -166,56 +160,11 @@ def draw(found: FileFixes, path: Path) -> None:
     write_picture(plot_fixes(found.loaded.problem, (found.fix,), title=found.loaded.title), path)
 
 
-def show(found: FileFixes, console: Console) -> None:
-    """Print the fixes: one fix in full, the states of a run one below the other, many fixes as a count by status."""
-    fix = found.fix
-    if len(found.columns["x"]) == 1:
-        _show_one(found, fix[0] if found.apart else fix, console)
-    elif not found.apart:
-        _show_one(found, fix, console)
-    else:
-        _show_many(found, console)
-
-
-def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
-    """Print one fix in full: table, biases, suspects, undetected errors and alternatives."""
-    sheet = fix_sheet(fix, found.columns, found.loaded.title)
-    rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
-    rows += [("wave speed", found.loaded.speed)] if found.loaded.speed not in ("", NOT_STATED) else []
-    table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
-    colour = _CARE if fix.unchecked and fix.status is Status.OK else _colour(Status(int(fix.code)))
-    table.add_row("status", Text(rows[0][1], style=f"bold {colour}"))
-    for row in rows[1:]:
-        table.add_row(*row)
-    console.print(table)
-    _show_sheet(bias_sheet(fix, found.seen, found.loaded.bias_unit), console)
-    converted = in_unit_of_stations(found.loaded, found.columns)
-    if converted and len(found.columns["x"]) == 1 and np.isfinite(found.columns["x"]).all():
-        parts = [(*name.split("_", 1), float(values[0])) for name, values in converted.items()]
-        say(
-            console, "The position is " + ", ".join(f"{axis} = {value:.6g} {unit}" for axis, unit, value in parts) + "."
-        )
-    say_all(console, () if found.seen is None else found.seen.sentences)
-    _show_sheet(suspect_sheet(fix), console)
-    _show_unnoticed(found, fix, console)
-    _show_sheet(alternative_sheet(fix), console)
-
-
-def _show_sheet(sheet: FixSheet | None, console: Console) -> None:
-    """Print a sheet with column names; print nothing without a sheet."""
-    if sheet is None:
-        return
-    table = Table(title=sheet.title, title_justify="left")
-    for name in sheet.head:
-        table.add_column(name, justify="left" if name in _TEXTS else "right")
-    for row in sheet.rows:
-        table.add_row(*row)
-    console.print(table)
-
-
-def _colour(verdict: Status) -> str:
-    """Return the colour of a status: green for ok, yellow for other answers, red for no answer."""
-    return _GOOD if verdict is Status.OK else _CARE if verdict in ANSWERED else _BAD
+def show(found: FileFixes, console: Console, advice: tuple[Advice, ...] = ()) -> None:
+    """Print the answer of the fixes of a file, and the errors that the search for suspects would not notice."""
+    show_answer(answer_of_file(found, advice), console)
+    if len(found.columns["x"]) == 1 or not found.apart:
+        _show_unnoticed(found, found.fix[0] if found.apart else found.fix, console)
 
 
 def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
@@ -225,25 +174,6 @@ def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
     from optloc.cli.crlb import reliability_of, show_reliability
 
     show_reliability(reliability_of(found.loaded.problem, fix.x, fix.suspects), console)
-
-
-def _show_many(found: FileFixes, console: Console) -> None:
-    """Print the number of fixes by status, and the reasons of the first ten fixes that are not ok."""
-    columns = found.columns
-    sheet = count_sheet(columns, f"{found.loaded.title}: ")
-    table = Table(title=sheet.title, title_justify="left")
-    for name in sheet.head:
-        table.add_column(name, justify="left" if name == "status" else "right")
-    for label, *cells in sheet.rows:
-        table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), *cells)
-    console.print(table)
-    bad = np.flatnonzero(columns["status"] != Status.OK.label)
-    for i in bad[:_FAILURES]:
-        say(console, f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}")
-    if len(bad) > _FAILURES:
-        say(console, f"... and {len(bad) - _FAILURES} more; --out writes all of them")
-    if found.loaded.azimuths:
-        say(console, f"Azimuths: {found.loaded.azimuths}.")
 
 
 # Noise from data.
@@ -420,14 +350,8 @@ def advice_json(found: tuple[Advice, ...]) -> list[dict[str, Any]]:
 
 def show_advice(found: tuple[Advice, ...], console: Console) -> None:
     """Print each observation and its advice, followed by the lines to copy into a problem file."""
-    if not found:
-        return
-    say(console, "Advice")
-    for one in found:
-        say(console, f"  {one.seen[0].upper()}{one.seen[1:]}.")
-        say(console, f"  {one.advice[0].upper()}{one.advice[1:]}{':' if one.toml else '.'}")
-        for line in one.toml.splitlines():
-            say(console, f"      {line}")
+    for line in advice_lines(found):
+        say(console, line)
 
 
 # Option --explain: a second fix with the error that explains most of the misfit.
@@ -468,7 +392,7 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
     table.add_row("p", before, as_p(float(fix.p_value)), "")
     rows = min(len(found.columns["x"]), _STATES)
     for i in range(rows):
-        owner = whose(found.columns, i) if len(found.columns["x"]) > 1 else ""
+        owner = _owner(found.columns, i) if len(found.columns["x"]) > 1 else ""
         for axis in _axes(found):
             one, two = (each.columns[axis][i] for each in (found, other))
             sigmas = [each.columns[f"sigma_{axis}"][i] for each in (found, other)]
@@ -487,3 +411,10 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
 def _axes(found: FileFixes) -> list[str]:
     """Return the names of the coordinates in the table of fixes, such as ["x", "y"]."""
     return [axis for axis in "xyz" if axis in found.columns]
+
+
+def _owner(columns: Columns, i: int) -> str:
+    """Return " of <target> at <epoch>" for row `i`; each part is empty if the table has only one target or epoch."""
+    several = "target" in columns and len(set(columns["target"].tolist())) > 1
+    epoch = f" at {columns['epoch'][i]}" if "epoch" in columns and columns["epoch"][i] != "run" else ""
+    return (f" of {columns['target'][i]}" if several else "") + epoch

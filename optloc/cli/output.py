@@ -11,14 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
+from optloc.base.types import Status
 from optloc.kernels.progress import Reporter
+from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
+from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,6 +53,52 @@ class Screen(Console):
 def say(console: Console, line: str) -> None:
     """Print a line unchanged: rich would colour numbers, interpret brackets and wrap the line."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+# Least width of a column of words, which wrap.
+_LEAST = 8
+_COLOURS = {"good": "green", "care": "yellow", "bad": "red"}
+
+
+def show_answer(answer: FixAnswer, console: Console) -> None:
+    """Print an answer: its main tables, its advice and its details, with the status in colour."""
+    for number, sheet in enumerate(answer.main):
+        show_sheet(sheet, console, _COLOURS[answer.verdict] if number == 0 else "")
+    for line in advice_lines(answer.advice):
+        say(console, visible(line))
+    for sheet in answer.details:
+        show_sheet(sheet, console)
+
+
+def show_sheet(sheet: FixSheet, console: Console, colour: str = "") -> None:
+    """Print a sheet of an answer; `colour` is the colour of the first text of a sheet without column names."""
+    # Sheets without column names have one width, so that tables of short texts are aligned.
+    width = None if sheet.head else 60
+    table = Table(title=sheet.title or None, title_justify="left", show_header=bool(sheet.head), min_width=width)
+    needed = 1
+    for place, name in enumerate(sheet.head):
+        cells_of_column = [row[place] for row in sheet.rows]
+        numeric = name not in TEXT_COLUMNS
+        # A number on two lines is misread. So a table that is too wide for the screen continues beyond its edge.
+        least = max(map(len, cells_of_column), default=0) if numeric else _LEAST
+        table.add_column(name, justify="right" if numeric else "left", min_width=least)
+        needed += least + 3
+    for number, row in enumerate(sheet.rows):
+        cells: list[str | Text] = list(row)
+        if number == 0 and colour and not sheet.head:
+            cells[1] = Text(row[1], style=f"bold {colour}")
+        elif "status" in sheet.head:
+            at = sheet.head.index("status")
+            cells[at] = Text(row[at], style=_status_colour(row[at].removesuffix(UNCHECKED_MARK)))
+        table.add_row(*cells, end_section=number in sheet.ends)
+    console.print(table, width=needed if needed > console.width else None, crop=False)
+
+
+def _status_colour(label: str) -> str:
+    """Return the colour of a status: green for ok, yellow for other answers, red for no answer; "" for no status."""
+    if not label:
+        return ""
+    return _COLOURS[verdict_of(Status[label.upper().replace(" ", "_")])]
 
 
 def say_all(console: Console, sentences: Sequence[str]) -> None:

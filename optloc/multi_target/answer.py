@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array, Status
 from optloc.multi_target.sets import value_width
 from optloc.problem.fix import Fix
@@ -36,8 +37,8 @@ class Ghost:
     gap: float
 
 
-@dataclass(frozen=True, slots=True)
-class Emitters:
+@dataclass(frozen=True, slots=True, repr=False)
+class Emitters(HasShortForm):
     """The emitters of one epoch, and the assignment of its rows to them.
 
     Parameters

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         plugin_module as plugin_module,
         plugins as plugins,
     )
+    from optloc.base.short_form import HasShortForm as HasShortForm, ShortForm as ShortForm
     from optloc.base.types import (
         ANSWERED as ANSWERED,
         PRECEDENCE as PRECEDENCE,

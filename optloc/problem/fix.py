@@ -355,7 +355,7 @@ class Fix:
         return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
 
     def __repr__(self) -> str:
-        """Return the text that the command line prints for a fix; for a batch the number of fixes of each status."""
+        """Return the answer as text, as the command line prints it; for a batch the table of its fixes."""
         return str(_RENDERER[0]().text_of(self)) if _RENDERER else object.__repr__(self)
 
     def _repr_html_(self) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import (
     AnyOf,
     Array,
@@ -39,8 +40,8 @@ from optloc.problem.noise import Block, Noise
 from optloc.problem.straight_phases import straight_s_rows
 
 
-@dataclass(frozen=True)  # without slots, because the cached properties need `__dict__`
-class Problem:
+@dataclass(frozen=True, repr=False)  # without slots, because the cached properties need `__dict__`
+class Problem(HasShortForm):
     """All data of an estimation problem. Leading axes of its arrays are a batch of independent problems.
 
     Parameters

@@ -156,18 +156,26 @@ def _states_of(fix: Fix) -> list[tuple[str, ...]]:
 def _numbered(fix: Fix, targets: int) -> Labels:
     """Return a function for the argument `labels` of `fix_columns`, for fixes without names.
 
-    Its columns are the index in the batch, the index of the epoch and the index of the target. A column is omitted if
-    it has only one value. `targets` is the number of targets.
+    Its columns are the label, the index in the batch, the index of the epoch and the index of the target. A column is
+    omitted if it has only one value, or if the fixes have no labels. `targets` is the number of targets.
     """
     n, k = len(fix), fix.layout.epochs
 
     def labels(target: int, by_epoch: bool) -> Columns:
-        rows = n * k if by_epoch else n
-        number = {"number": np.arange(rows) // (k if by_epoch else 1)} if n > 1 else {}
+        count = k if by_epoch else 1
+        rows = n * count
+        own = {} if fix.labels is None else _repeat(count, label=[_plain_label(one) for one in fix.labels])
+        number = {"number": np.arange(rows) // count} if n > 1 else {}
         epoch = {"epoch": np.tile(np.arange(k), n)} if by_epoch else {}
-        return number | epoch | ({"target": np.full(rows, target)} if targets > 1 else {})
+        return own | number | epoch | ({"target": np.full(rows, target)} if targets > 1 else {})
 
     return labels
+
+
+def _plain_label(label: Any) -> Any:
+    """Return a label as a value of files: texts and whole numbers are unchanged, other labels become text."""
+    value = label.item() if isinstance(label, np.generic) and not isinstance(label, np.datetime64) else label
+    return value if isinstance(value, str | int) else str(value)
 
 
 def _target_rows(

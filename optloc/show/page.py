@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
+from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +19,9 @@ from optloc.base.types import Array
 from optloc.bounds.over_area import BoundMap
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.show.columns import UNCHECKED
+from optloc.show.describe_fix import answer_of
 from optloc.show.drawing import Drawing, Look
+from optloc.show.fix_answer import FixAnswer
 from optloc.show.map import (
     Canvas,
     Curve,
@@ -43,10 +42,8 @@ from optloc.show.map import (
 )
 from optloc.show.pictures.bound_map import COLOURS, isolines, levels
 from optloc.show.pictures.style import BLACK, BLUE, ORANGE
+from optloc.show.render import environment
 from optloc.show.sheet import Sheet
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +100,7 @@ def write_page(
     facts: str = "",
     methods: Iterable[Look] = (),
     live: bool = False,
+    answers: Sequence[FixAnswer] = (),
 ) -> str:
     """Return a page as HTML.
 
@@ -120,33 +118,17 @@ def write_page(
         Methods for a legend that stays visible.
     live : bool
         Whether the map requests new fixes from its server once a second.
+    answers : sequence of FixAnswer
+        Answers as text above the sections; they need no script.
     """
-    page = _environment().get_template("page.html")
-    return page.render(title=title, parts=parts, opening=opening, facts=facts, methods=list(methods), live=live)
+    page = environment().get_template("page.html")
+    values = {"title": title, "parts": parts, "opening": opening, "facts": facts, "answers": answers}
+    return page.render(values, methods=list(methods), live=live)
 
 
-@cache
-def _environment() -> Environment:
-    """Return the environment of the templates, which reads and fills the templates of this package."""
-    # Import here: commands that write no page run without jinja2.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    # With StrictUndefined, a misspelt value raises an error instead of leaving a gap in the page.
-    made = Environment(
-        loader=PackageLoader("optloc.show"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    made.globals["asset"] = _asset
-    return made
-
-
-def _asset(name: str) -> str:
-    """Return a style sheet or a script as text; its braces must not be parsed as template syntax."""
-    return (files("optloc.show") / "templates" / name).read_text(encoding="utf-8")
-
+# A row has about 200 bytes, so that the table adds at most a fifth of a megabyte.
+LISTED = 1000
+"""Number of fixes that the table of a page shows completely; of more, it shows the first and the last."""
 
 # Pages with an interactive map: of fixes or tracks, with ellipses and lines of position, or of a bound.
 
@@ -165,8 +147,14 @@ _STATION, _MIDDLE, _MARK, _SMALL = 11, 7, 11, 5
 _FEW = 12
 
 
-def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: Sequence[str] = ()) -> str:
-    """Return an HTML page with an interactive map of fixes; the page needs no server and no network.
+def fix_page(
+    problem: Problem,
+    fixes: Fix | Sequence[Fix],
+    title: str,
+    labels: Sequence[str] = (),
+    answer: FixAnswer | None = None,
+) -> str:
+    """Return an HTML page with the answer as text and an interactive map; the page needs no server and no network.
 
     Parameters
     ----------
@@ -178,6 +166,8 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
         Title of the page.
     labels : sequence of str
         Names of the fixes, for instance their epochs.
+    answer : FixAnswer, optional
+        Text above the map. By default, the answers of the fixes.
 
     Raises
     ------
@@ -189,12 +179,15 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
     # Lines of position need a single fix.
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
-    # Number of fixes without redundancy.
-    alone = sum(int(np.sum(fix.unchecked)) for fix in several)
-    count = sum(fix.code.size for fix in several)
-    which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
-    first, shapes = f"{which}{UNCHECKED}." if alone else "", constraint_lines(problem, several)
-    return _marks_page(problem, found, others, title, "fix", single, first, shapes)
+    shown = [_answer(fix, labels) for fix in several] if answer is None else [replace(answer, title="")]
+    return _marks_page(problem, found, others, title, "fix", single, constraint_lines(problem, several), shown)
+
+
+def _answer(fix: Fix, labels: Sequence[str]) -> FixAnswer:
+    """Return the answer of fixes, with the labels of the page if there is one for each fix."""
+    if fix.labels is None and fix.shape and len(labels) == fix.code.size:
+        fix = replace(fix, labels=np.array(labels, dtype=object).reshape(fix.shape))
+    return answer_of(fix, most=LISTED)
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
@@ -263,14 +256,14 @@ def _marks_page(
     title: str,
     role: str,
     single: Fix | None,
-    first: str = "",
     shapes: Sequence[tuple[str, Array]] = (),
+    answers: Sequence[FixAnswer] = (),
 ) -> str:
     """Return the HTML of a page with the map of fixes or tracks.
 
     `marks` are the marks of fixes or scans, and `others` the marks of alternatives. `role` names a mark, "fix" or
-    "track". `single` is the fix if there is only one fix, for lines of position. `first` is a paragraph above the map;
-    it may be empty. `shapes` are names and lines (n, 2), degrees, of constraints.
+    "track". `single` is the fix if there is only one fix, for lines of position. `shapes` are names and lines (n, 2),
+    degrees, of constraints. `answers` are shown above the map.
     """
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _map_limits([stations.place, marks.place, others.place, *(line for _, line in tracks)])
@@ -296,7 +289,7 @@ def _marks_page(
     text += " Brown: limits of the target." if shapes else ""
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
-    return write_page(title, [PagePart("map", "Map", first[:1].upper() + first[1:], maps=[canvas], note=note)])
+    return write_page(title, [PagePart("map", "Map", maps=[canvas], note=note)], answers=answers)
 
 
 def _map_limits(places: Sequence[Array]) -> tuple[float, float, float, float]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array
 from optloc.engine.plan import Plan, plan_of
 from optloc.problem.epochs import separable
@@ -23,8 +24,8 @@ from optloc.solvers.solution import solve, solve_in_stages
 from optloc.solvers.verdict.judge import verdict
 
 
-@dataclass(frozen=True, slots=True)
-class Prepared:
+@dataclass(frozen=True, slots=True, repr=False)
+class Prepared(HasShortForm):
     """A problem that is prepared to fix new measurements; see `prepare`.
 
     Parameters

@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array, Motion, Status
 from optloc.kernels.filter import CODE, GENERAL, Move
 from optloc.problem.epochs import cut
@@ -48,8 +49,8 @@ class State:
     cov: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
+@dataclass(frozen=True, slots=True, repr=False)
+class Track(HasShortForm):
     """States of a target over time (k scans); a batch of targets has leading axes (...).
 
     Parameters

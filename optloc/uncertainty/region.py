@@ -13,6 +13,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array
 from optloc.kernels.jit import enabled
 from optloc.kernels.sums import equations_at
@@ -91,8 +92,8 @@ class Cells:
         return np.asarray(self.base + apart)
 
 
-@dataclass(frozen=True, slots=True)
-class Region:
+@dataclass(frozen=True, slots=True, repr=False)
+class Region(HasShortForm):
     """All positions whose cost exceeds the cost of a fix by at most a quantile of chi-square.
 
     Parameters

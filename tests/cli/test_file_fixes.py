@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import Status, solve
-from optloc.cli.file_fixes import fix_file, fixes_json, results_of
+from optloc.cli.file_fixes import answer_of_file, fix_file, fixes_json, results_of
 from optloc.cli.options import shipped_problems
 from optloc.cli.output import dumps
 from optloc.files import read
@@ -31,3 +31,27 @@ def test_json_holds_the_rows_of_the_table(found):
     assert [row["x"] for row in told["fixes"]] == pytest.approx(found.columns["x"].tolist())
     assert told["title"] == found.loaded.title
     assert results_of(found).columns is found.columns
+
+
+EVENTS = """format = 2
+[stations]
+rows = [{ name = "A", x = 0, y = 0 }, { name = "B", x = 900, y = 0 }, { name = "C", x = 0, y = 900 }]
+[[measurements]]
+kind = "range"
+sigma = "1 m"
+rows = [
+  { epoch = "morning", time = 0, a = "A", z = 500 }, { epoch = "morning", time = 0, a = "B", z = 721.11 },
+  { epoch = "morning", time = 0, a = "C", z = 583.1 }, { epoch = "evening", time = 9, a = "A", z = 500 },
+  { epoch = "evening", time = 9, a = "B", z = 721.11 }, { epoch = "evening", time = 9, a = "C", z = 583.1 },
+]
+"""
+
+
+def test_the_answer_of_a_file_has_the_names_of_its_events(tmp_path, found):
+    assert answer_of_file(found).title == found.loaded.title
+    (tmp_path / "events.toml").write_text(EVENTS)
+    events = fix_file(read(tmp_path / "events.toml"), "auto", quiet=True)
+    table = answer_of_file(events).section("where").sheets[0]
+    assert table.head == ("epoch", "x, m", "y, m", "sigma, m", "status")
+    assert [row[0] for row in table.rows] == ["morning", "evening"]
+    assert answer_of_file(events).section("use").rows[0] == ("status", "2 fixes: all ok")

@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from optloc import InvalidProblem
-from optloc.cli.output import Screen, claim_outputs, dumps, is_csv, meter, say_all, write_table, write_text
+from optloc.cli.output import Screen, claim_outputs, dumps, is_csv, meter, say_all, show_sheet, write_table, write_text
+from optloc.show.fix_answer import FixSheet
 
 
 def test_json_is_strict():
@@ -23,6 +24,15 @@ def test_sentences_begin_large_and_end_with_a_full_stop(capsys):
 def test_what_would_steer_the_terminal_is_spelled(capsys):
     Screen().print("a\x1b[31mb")
     assert "\x1b" not in capsys.readouterr().out
+
+
+def test_numbers_of_a_table_stay_on_one_line_of_a_narrow_screen(capsys):
+    screen = Screen()
+    screen.width = 30
+    cells = [f"{number}.123456" for number in range(1000, 1008)]
+    show_sheet(FixSheet("Fixes", (*(f"x{i}, m" for i in range(8)), "status"), [(*cells, "ok, unchecked")]), screen)
+    printed = capsys.readouterr().out
+    assert all(cell in printed for cell in cells)
 
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])

@@ -283,8 +283,9 @@ class Results:
         )
 
     def _name(self, row: dict[str, Any]) -> str:
-        """Return the name of a row: target, number and epoch, each only if the table has several."""
-        several = [n for n in ("target", "number", "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
+        """Return the name of a row: target, label or number, and epoch, each only if the table has several."""
+        own = "label" if "label" in row else "number"
+        several = [n for n in ("target", own, "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
         return " ".join(str(row[name]) for name in several) or str(row.get("target", "fix"))
 
     def _others(self) -> list[tuple[Other, ...]]:
@@ -390,7 +391,7 @@ def geojson(results: Results) -> dict[str, Any]:
     skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
     rows = records(results.columns)
     for row, mark, area, known in zip(rows, results.marks(), results.areas(), results.known(), strict=True):
-        about: dict[str, Any] = {name: row[name] for name in ("number", "epoch", "target") if name in row}
+        about: dict[str, Any] = {name: row[name] for name in ("label", "number", "epoch", "target") if name in row}
         properties = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
         if mark.known:
             features.append(feature(point_geometry(mark.place), {"role": "fix", **properties}))

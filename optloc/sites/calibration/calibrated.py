@@ -15,7 +15,16 @@ from functools import partial
 
 import numpy as np
 
-from optloc.problem import PRECEDENCE, Array, InvalidProblem, NoSolution, Status, no_station, tail_probability
+from optloc.problem import (
+    PRECEDENCE,
+    Array,
+    HasShortForm,
+    InvalidProblem,
+    NoSolution,
+    Status,
+    no_station,
+    tail_probability,
+)
 from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
 from optloc.sites.calibration.gauge import (
     departure,
@@ -24,6 +33,7 @@ from optloc.sites.calibration.gauge import (
     flat,
     in_frame,
     over,
+    spans,
     with_mean_clock,
 )
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
@@ -73,8 +83,8 @@ class Alternative:
     pulses: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
+@dataclass(frozen=True, slots=True, repr=False)
+class Calibration(HasShortForm):
     """A network with its covariance and status.
 
     Parameters
@@ -170,19 +180,6 @@ class Calibration:
         if self.status is not Status.OK and self.status.label not in allow:
             raise NoSolution(self.network, self)
         return self
-
-
-def spans(stations: Array) -> tuple[Array, Array, Array]:
-    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives of these (q, M d)."""
-    m, d = stations.shape
-    pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
-    line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
-    length = np.linalg.norm(line, axis=1)
-    unit = line / np.maximum(length, 1e-300)[:, None]
-    jacobian = np.zeros((len(pairs), m, d))
-    every = np.arange(len(pairs))
-    jacobian[every, pairs[:, 0]], jacobian[every, pairs[:, 1]] = unit, -unit
-    return pairs, length, jacobian.reshape(len(pairs), m * d)
 
 
 def calibrate(

@@ -346,3 +346,16 @@ def _may_be_mirrored(net: Network, stations: Array, pulses: Array) -> bool:
     cost_mirrored, cost_present = ((np.where(known, x - net.place, 0.0) / sigma) ** 2 for x in (there, stations))
     extra_cost = np.bincount(group, (cost_mirrored - cost_present).sum(axis=1), count)
     return count > 1 and bool((extra_cost < AMBIGUOUS_GAP).any())
+
+
+def spans(stations: Array) -> tuple[Array, Array, Array]:
+    """Return all pairs of stations (q, 2), their distances (q,), metres, and the derivatives of these (q, M d)."""
+    m, d = stations.shape
+    pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
+    line = stations[pairs[:, 0]] - stations[pairs[:, 1]]
+    length = np.linalg.norm(line, axis=1)
+    unit = line / np.maximum(length, 1e-300)[:, None]
+    jacobian = np.zeros((len(pairs), m, d))
+    every = np.arange(len(pairs))
+    jacobian[every, pairs[:, 0]], jacobian[every, pairs[:, 1]] = unit, -unit
+    return pairs, length, jacobian.reshape(len(pairs), m * d)

@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.files import positive_speed, stated_speed
 from optloc.models import MODELS
-from optloc.problem import SPEED_OF_LIGHT, Amount, Array, InvalidProblem, check_once
+from optloc.problem import SPEED_OF_LIGHT, Amount, Array, HasShortForm, InvalidProblem, check_once
 
 CLOCKED = ("toa", "tdoa")
 """Kinds that depend on the station clock; a two-way range does not."""
@@ -40,8 +40,8 @@ class NetworkSlot:
     b: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Network:
+@dataclass(frozen=True, slots=True, repr=False)
+class Network(HasShortForm):
     """Measurements between stations and pulses at unknown positions.
 
     Parameters

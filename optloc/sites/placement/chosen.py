@@ -20,7 +20,7 @@ import numpy as np
 from formulations.placement import covariances
 from optloc.bounds import bound_map, crlb, extent, map_coordinates
 from optloc.engine import degrees_of_freedom, simulate
-from optloc.problem import Array, InvalidProblem, Status
+from optloc.problem import Array, HasShortForm, InvalidProblem, Status
 from optloc.sites.placement.best_set import BestSetResult, SearchTask, random_sets, search
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
@@ -97,8 +97,8 @@ class Draws:
         return float(self.ambiguous.mean()) <= AMBIGUOUS
 
 
-@dataclass(frozen=True, slots=True)
-class Placement:
+@dataclass(frozen=True, slots=True, repr=False)
+class Placement(HasShortForm):
     """A set of sites, with a proven bound for all sets of the candidates (P places).
 
     Parameters

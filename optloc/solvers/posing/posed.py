@@ -63,10 +63,6 @@ class Posed(PosedProblem, ABC):
         # names of constraints and fences of the problem that the posed problem lacks; only the refinement obeys them
         self.dropped: list[str] = []
 
-    def __repr__(self) -> str:
-        """Return the name of the formulation, and the changes, as text."""
-        return f"<posed problem {self.formulation!r}{self._changes()}>"
-
     # Parts in SI units.
 
     @abstractmethod

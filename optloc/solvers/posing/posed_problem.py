@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array
 
 # The relation that messages show to users, unless a problem has other unknowns.
@@ -64,7 +65,7 @@ class StatedProgram(Protocol):
         """Rewrite `problem` after a change of the relations."""
 
 
-class PosedProblem:
+class PosedProblem(HasShortForm):
     """An optimisation problem to read and to change.
 
     Parameters

@@ -78,9 +78,9 @@ def test_refinement_is_a_choice(formulation):
 @pytest.mark.parametrize("formulation", ["squared_range_conic: hull", "nls"])
 def test_its_text_names_the_formulation_and_the_changes(formulation):
     posed = pose(ranged(2), formulation)
-    assert repr(posed) == f"<posed problem '{formulation}'>"
+    assert repr(posed).startswith(f"Posed problem '{formulation}'\n")
     posed.add(posed.position[0] <= 1e9, name="fence")
-    assert repr(posed) == f"<posed problem '{formulation}' with constraint \"fence\">"
+    assert "fence" in repr(posed)
 
 
 def apart_from_solve(formulation, seeds):
