@@ -153,10 +153,11 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
         if plot is not None:
             draw(found, plot)
         if html is not None:
-            from optloc.show.page import fix_page
+            from optloc.show.maps.map_pages import fix_page
 
-            labels = [str(label) for label in found.columns["epoch"]]
-            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels))
+            marks = results_of(found).marks()
+            labels, times = [mark.name for mark in marks], [mark.time for mark in marks]
+            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, times))
 
 
 def draw(found: FileFixes, path: Path) -> None:

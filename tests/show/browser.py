@@ -98,11 +98,15 @@ class Browser:
         elif method == "Network.requestWillBeSent" and not what["request"]["url"].startswith("data:"):
             self.requests.append(what["request"]["url"])
 
-    def open(self, path, width=1280, height=900, *, phone=False):
-        """Open a file and wait until it is loaded."""
+    def open(self, path, width=1280, height=900, *, phone=False, dark=False, scripts=True):
+        """Open a file or an address and wait until it is loaded; without `scripts`, the page runs none of its own."""
         self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.ask("Emulation.setEmulatedMedia", features=[theme])
+        self.ask("Emulation.setScriptExecutionDisabled", value=not scripts)
         self.events.clear()
-        self.ask("Page.navigate", url=Path(path).resolve().as_uri())
+        url = path if str(path).startswith("http") else Path(path).resolve().as_uri()
+        self.ask("Page.navigate", url=url)
         end = time.monotonic() + PATIENCE
         while "Page.loadEventFired" not in self.events:
             assert time.monotonic() < end, "the page does not load"

@@ -17,7 +17,7 @@ from optloc.lab.study.design import design_of
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import begin, read_frame
 from optloc.show.drawing import marks as looks_of, panel, svg_text
-from optloc.show.map import Canvas, Curve, Label
+from optloc.show.maps.canvas import Canvas, Curve, Label
 from optloc.show.page import PagePart, write_page
 from optloc.show.sheet import Sheet, TextTable
 
