@@ -387,10 +387,10 @@ class Latest:
             # A stored record is never changed, only replaced: the same object has the same mark.
             if drawn is None or drawn[0] is not record:
                 trail = [np.array(place) for place in list(self._trails.get(name, ()))]
-                mark = live_mark(frame, to_mark(record, frame), trail) | {"received": round(now - age, 1)}
+                mark = live_mark(frame, to_mark(record, frame), trail) | {"received": round(now - age, 3)}
                 drawn = self._drawn[name] = (record, _finite(mark))
             found.append(drawn[1])
-        return {"now": round(now, 1), "last": self._last, "fixes": found}
+        return {"now": round(now, 3), "last": self._last, "fixes": found}
 
     def aircraft(self) -> Record:
         """Return the latest fixes as readsb's ``aircraft.json``."""

@@ -18,6 +18,13 @@ def executable():
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
+def kept(browser, name):
+    """Write a picture of the whole page into the folder that OPTLOC_SCREENSHOTS names; without the variable, do nothing."""
+    if folder := os.environ.get("OPTLOC_SCREENSHOTS"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        browser.picture(Path(folder) / f"{name}.png", whole=True)
+
+
 class Browser:
     """One browser with one tab; `messages` are its complaints: console errors, exceptions, requests to a network."""
 
@@ -126,3 +133,30 @@ class Browser:
     def pdf(self):
         """Return the page as it is printed."""
         return base64.b64decode(self.ask("Page.printToPDF", printBackground=True)["data"])
+
+
+# Texts that a reader sees: size on the screen with the scale of the drawing, and texts that are wider than their box.
+TOO_SMALL = """(() => { const seen = e => e.textContent.trim() && e.checkVisibility({ visibilityProperty: true }) && ![...e.children].length;
+  const size = e => { const m = e.getScreenCTM && e.tagName === 'text' ? e.getScreenCTM().a : 1; return parseFloat(getComputedStyle(e).fontSize) * m; };
+  return [...document.querySelectorAll('body *')].filter(e => !['SCRIPT', 'STYLE', 'TITLE', 'DESC', 'title', 'desc'].includes(e.tagName) && seen(e))
+    .filter(e => size(e) < 9).map(e => e.tagName + ' ' + e.textContent.slice(0, 20) + ' ' + size(e)); })()"""
+_CLIPPED = """[...document.querySelectorAll('code, .status, .size, .copy, .key li, .layers label, output, p, h1, h2')]
+  .filter(e => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline').map(e => e.textContent.slice(0, 30))"""
+_COVERED = """(() => { const boxes = [...document.querySelectorAll('.map text:not(.off)')]
+    .filter(e => e.checkVisibility()).map(e => e.getBoundingClientRect());
+  return boxes.filter((a, i) => boxes.some((b, j) => j < i && a.x < b.right - 2 && b.x < a.right - 2 && a.y < b.bottom - 4 && b.y < a.bottom - 4)).length; })()"""
+
+
+def readable(browser, path, name):
+    """Open a page at both widths and in both themes, keep pictures, and check that every text is readable."""
+    for width, phone in ((1280, False), (390, True)):
+        for dark in (False, True):
+            browser.open(path, width, 844, phone=phone, dark=dark)
+            browser.run("new Promise(done => setTimeout(done, 300))")
+            case = f"{name}-{width}{'-dark' if dark else ''}"
+            kept(browser, case)
+            assert browser.messages == [], case
+            assert browser.run("document.documentElement.scrollWidth") <= width, case
+            assert browser.run(TOO_SMALL) == [], case
+            assert browser.run(_CLIPPED) == [], case
+            assert browser.run(_COVERED) == 0, case

@@ -19,7 +19,6 @@ from optloc.show.page import PagePart, write_page
 from optloc.show.pictures.bound_map import COLOURS, isolines, levels
 
 
-
 def map_page(found: BoundMap, title: str) -> str:
     """Return an HTML page with the interactive map of a bound; the page needs no network.
 

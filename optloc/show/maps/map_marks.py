@@ -249,7 +249,9 @@ def _decimals(sigma: Array, least: int) -> int:
 
 def metres(length: float) -> str:
     """Return a length, m, as text with three digits, in km from 1000 m on."""
-    return f"{length:.3g} m" if length < 999.5 else f"{length / 1e3:.3g} km" if length < 1e6 else f"{length / 1e3:.0f} km"
+    return (
+        f"{length:.3g} m" if length < 999.5 else f"{length / 1e3:.3g} km" if length < 1e6 else f"{length / 1e3:.0f} km"
+    )
 
 
 def time_text(time: float) -> str:
@@ -285,7 +287,9 @@ def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
     count, d = position.shape
     unknown = np.full((count, d, d), np.nan)
     rows = tuple(
-        replace(map_row(problem.frame, "", np.nan, f"alternative, cost gap {gap:.3g}", "", False, *each), look="rival other")
+        replace(
+            map_row(problem.frame, "", np.nan, f"alternative, cost gap {gap:.3g}", "", False, *each), look="rival other"
+        )
         for gap, each in zip(gaps, zip(position, unknown, strict=True), strict=True)
     )
     found = spots(problem, position, unknown, np.zeros(count, dtype=bool), [row_text(row) for row in rows])

@@ -147,7 +147,10 @@ def _station_texts(problem: Problem) -> list[tuple[str, str]]:
     position = problem.stations.position.reshape(-1, problem.stations.count, d)[0]
     unknown = np.full((d, d), np.nan)
     rows = [map_row(problem.frame, "", np.nan, "", "", False, place, unknown) for place in position]
-    return [(name, ", ".join(filter(None, (row.place, row.size)))) for name, row in zip(problem.stations.names, rows, strict=True)]
+    return [
+        (name, ", ".join(filter(None, (row.place, row.size))))
+        for name, row in zip(problem.stations.names, rows, strict=True)
+    ]
 
 
 def _marks_page(

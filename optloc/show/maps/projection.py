@@ -98,9 +98,7 @@ def map_limits(places: Sequence[Array], *, flat: bool = False) -> Window:
     squeeze = np.array([1.0 if flat else np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
     # Half the width and height with margins, in degrees of latitude; the least extent is for a single point.
     extent = (high - low) * squeeze
-    half = (0.5 + RIM) * np.maximum(
-        extent, _SLIMMEST * float(extent.max() or (_LEAST_FLAT if flat else _LEAST))
-    )
+    half = (0.5 + RIM) * np.maximum(extent, _SLIMMEST * float(extent.max() or (_LEAST_FLAT if flat else _LEAST)))
     (west, south), (east, north) = (low + high) / 2.0 - half / squeeze, (low + high) / 2.0 + half / squeeze
     if flat:
         return float(west), float(east), float(south), float(north)
@@ -141,5 +139,7 @@ def short_path(lines: Sequence[Array], *, close: bool) -> str:
 
 def _joined(tenths: Array) -> str:
     """Return numbers in tenths as the shortest text that path data permit: no zero before a point, minus as separator."""
-    texts = [f"{value / 10:g}".replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}" for value in tenths.tolist()]
+    texts = [
+        f"{value / 10:g}".replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}" for value in tenths.tolist()
+    ]
     return "".join(text if text.startswith("-") or i == 0 else f" {text}" for i, text in enumerate(texts))

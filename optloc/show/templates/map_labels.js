@@ -7,6 +7,9 @@ const importance = ["name", "mark", "level", "along", "coordinate", "city"];
 // Width of a letter in pixels, for labels whose width is not known because their layer is hidden.
 const letter = 6.6;
 
+// Number of marks that labels avoid; more marks cover the map.
+const marksAtMost = 400;
+
 const labelWidth = (label, unit) => {
   if (!label.pixels) {
     const length = label.getComputedTextLength();
@@ -20,13 +23,15 @@ const hiddenLayer = element => element.parentNode.style.display === "none";
 
 // Show each label that overlaps no more important label and no mark.
 const layLabels = (sheet, area, unit) => {
-  const taken = [];
+  // The buttons and the scale bar cover two corners.
+  const [left, top, , bottom] = area;
+  const taken = [[left, top, left + 50 * unit, top + 170 * unit], [left, bottom - 30 * unit, left + 155 * unit, bottom]];
   for (const mark of sheet.querySelectorAll("[data-tell].dot, g[data-tell]")) {
     if (hiddenLayer(mark)) continue;
     const place = mark.getAttribute("d") ?? mark.getAttribute("transform");
     const [x, y] = place.match(/-?[\d.]+(?:e-?\d+)?/g).map(Number);
     taken.push([x - 6 * unit, y - 6 * unit, x + 6 * unit, y + 6 * unit]);
-    if (taken.length > 400) break; // more marks cover the map
+    if (taken.length > marksAtMost) break;
   }
   const free = box => box[0] > area[0] && box[2] < area[2] && box[1] > area[1] && box[3] < area[3]
     && !taken.some(other => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3]);
