@@ -362,8 +362,9 @@ class Latest:
         self._total += 1
         if len(self._held) > self._most:
             gone = next(iter(self._held))
-            for stored in (self._held, self._trails, self._drawn):
-                stored.pop(gone, None)  # type: ignore[attr-defined]
+            self._held.pop(gone, None)
+            self._trails.pop(gone, None)
+            self._drawn.pop(gone, None)
 
     def _present(self) -> list[tuple[float, Record]]:
         """Return the age (s) and the record of each target with a fix in the last minute."""

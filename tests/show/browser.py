@@ -19,7 +19,7 @@ def executable():
 
 
 def kept(browser, name):
-    """Write a picture of the whole page into the folder that OPTLOC_SCREENSHOTS names; without the variable, do nothing."""
+    """Write a picture of the whole page into the folder of the variable OPTLOC_SCREENSHOTS, if there is one."""
     if folder := os.environ.get("OPTLOC_SCREENSHOTS"):
         Path(folder).mkdir(parents=True, exist_ok=True)
         browser.picture(Path(folder) / f"{name}.png", whole=True)
@@ -135,16 +135,26 @@ class Browser:
         return base64.b64decode(self.ask("Page.printToPDF", printBackground=True)["data"])
 
 
-# Texts that a reader sees: size on the screen with the scale of the drawing, and texts that are wider than their box.
-TOO_SMALL = """(() => { const seen = e => e.textContent.trim() && e.checkVisibility({ visibilityProperty: true }) && ![...e.children].length;
-  const size = e => { const m = e.getScreenCTM && e.tagName === 'text' ? e.getScreenCTM().a : 1; return parseFloat(getComputedStyle(e).fontSize) * m; };
-  return [...document.querySelectorAll('body *')].filter(e => !['SCRIPT', 'STYLE', 'TITLE', 'DESC', 'title', 'desc'].includes(e.tagName) && seen(e))
-    .filter(e => size(e) < 9).map(e => e.tagName + ' ' + e.textContent.slice(0, 20) + ' ' + size(e)); })()"""
-_CLIPPED = """[...document.querySelectorAll('code, .status, .size, .copy, .key li, .layers label, output, p, h1, h2')]
-  .filter(e => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline').map(e => e.textContent.slice(0, 30))"""
-_COVERED = """(() => { const boxes = [...document.querySelectorAll('.map text:not(.off)')]
-    .filter(e => e.checkVisibility()).map(e => e.getBoundingClientRect());
-  return boxes.filter((a, i) => boxes.some((b, j) => j < i && a.x < b.right - 2 && b.x < a.right - 2 && a.y < b.bottom - 4 && b.y < a.bottom - 4)).length; })()"""
+# Texts that a reader sees: size on the screen with the scale of the drawing, texts that are wider than their box, and
+# labels of the map that cover each other.
+TOO_SMALL = """(() => {
+  const seen = e => e.textContent.trim() && e.checkVisibility({ visibilityProperty: true }) && !e.children.length;
+  const scale = e => e.tagName === 'text' ? e.getScreenCTM().a : 1;
+  const size = e => parseFloat(getComputedStyle(e).fontSize) * scale(e);
+  const parts = [...document.querySelectorAll('body *')].filter(e => !/^(script|style|title|desc)$/i.test(e.tagName));
+  return parts.filter(e => seen(e) && size(e) < 9).map(e => `${e.tagName} ${e.textContent.slice(0, 20)} ${size(e)}`);
+})()"""
+_CLIPPED = """(() => {
+  const parts = document.querySelectorAll('code, .status, .size, .copy, .key li, .layers label, output, p, h1, h2');
+  const wide = e => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline';
+  return [...parts].filter(wide).map(e => e.textContent.slice(0, 30));
+})()"""
+_COVERED = """(() => {
+  const labels = [...document.querySelectorAll('.map text:not(.off)')].filter(e => e.checkVisibility());
+  const boxes = labels.map(e => e.getBoundingClientRect());
+  const meet = (a, b) => a.x < b.right - 2 && b.x < a.right - 2 && a.y < b.bottom - 4 && b.y < a.bottom - 4;
+  return boxes.filter((a, i) => boxes.some((b, j) => j < i && meet(a, b))).length;
+})()"""
 
 
 def readable(browser, path, name):

@@ -68,8 +68,8 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
         legend += [LegendEntry("ok", "trial"), LegendEntry("bad", "trial with a wrong result that is ok")]
     summary = f"Map of the bound of the position error, with {len(found.names)} stations. {_map_text(found)}"
     bound = {"bound": [_image(found, plane), *_lines(found, plane)]}
-    about = {"under": bound, "legend": legend, "summary": summary}
-    return map_canvas(plane, name, title, layers, _data(found), _map_text(found), **about)
+    text = _map_text(found)
+    return map_canvas(plane, name, title, layers, _data(found), text, under=bound, legend=legend, summary=summary)
 
 
 def _map_text(found: BoundMap) -> str:
@@ -147,7 +147,8 @@ def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
 def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
     """Return at most `_DOTS` trials as dots at longitude and latitude `places` (n, 2), degrees.
 
-    Trials with a wrong result, marked by `off` (n,), have another colour and shape and are larger. `plane` is the projection of the map.
+    Trials with a wrong result, marked by `off` (n,), have another colour and shape and are larger. `plane` is the
+    projection of the map.
     """
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
     order = kept[np.argsort(off[kept], kind="stable")]  # Draw wrong trials last, on top.

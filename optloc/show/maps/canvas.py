@@ -25,7 +25,7 @@ class Curve:
         Path data, in units of the drawing.
     width : float
         Width of the stroke, pixels at any zoom; 0 for the width of the style sheet.
-    tell : str
+    hover : str
         Text that the page shows while the pointer is on the curve.
     row : int
         Number of the row of the list that belongs to a mark; -1 if there is no row.
@@ -34,7 +34,7 @@ class Curve:
     kind: str
     d: str
     width: float = 0.0
-    tell: str = ""
+    hover: str = ""
     row: int = -1
     shape: ClassVar = "curve"  # The template selects the SVG element by the shape.
 
@@ -71,13 +71,13 @@ class Symbol:
     ----------
     x, y : float
         Centre, in units of the drawing.
-    tell : str
+    hover : str
         Text that the page shows while the pointer is on the symbol.
     """
 
     x: float
     y: float
-    tell: str
+    hover: str
     shape: ClassVar = "symbol"
 
 
@@ -108,7 +108,7 @@ Drawn = Curve | Label | Symbol | Image
 
 @dataclass(frozen=True, slots=True)
 class MapRow:
-    """A row of the list beside a map: one fix, one scan of a track, or one alternative.
+    """A row of the list of a map: one fix, one scan of a track, or one alternative.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class Canvas:
     off : frozenset of str
         Layers that are hidden at first.
     rows : sequence of MapRow
-        Rows of the list beside the map.
+        Rows of the list of positions.
     counted : str
         Text above the list, for instance the number of fixes of each status.
     stations : sequence of (str, str)
@@ -246,9 +246,9 @@ def map_canvas(
     return Canvas(name, title, fitted, text, box, shore, known, border, **more)
 
 
-def dot(x: float, y: float, look: str, size: float, tell: str = "", row: int = -1) -> Curve:
-    """Return a dot of `size` pixels at any zoom; the page shows `tell` while the pointer is on the dot."""
-    return Curve(f"dot {look}", f"M{x:.9g} {y:.9g}h0", size, tell, row)
+def dot(x: float, y: float, look: str, size: float, hover: str = "", row: int = -1) -> Curve:
+    """Return a dot of `size` pixels at any zoom; the page shows `hover` while the pointer is on the dot."""
+    return Curve(f"dot {look}", f"M{x:.9g} {y:.9g}h0", size, hover, row)
 
 
 def _city_labels(plane: Plane) -> list[Label]:
@@ -282,7 +282,7 @@ def fitting(layers: Mapping[str, Sequence[Drawn]], plane: Plane) -> dict[str, Se
         else:
             boxes = np.vstack([boxes, box])
     return {
-        name: [replace(one, shown=False) if id(one) in hidden else one for one in drawn]  # type: ignore[type-var]
+        name: [replace(one, shown=False) if isinstance(one, Label) and id(one) in hidden else one for one in drawn]
         for name, drawn in layers.items()
     }
 

@@ -22,7 +22,7 @@ _DIGITS = 5
 _MARK, _SMALL, _FEW = 12, 8, 12
 # Diameter of the white centre of a mark, as a share of its size.
 _CENTRE = 0.45
-# Looks whose marks have a white or black centre, which tells them apart without colours.
+# Looks whose marks have a white or black centre, which distinguishes them without colours.
 _HOLLOW = {"alone", "care", "rival"}
 # Maximum number of names of marks, of lines with a name at the line, and of rows of the list. More names would not fit,
 # and more rows would make a page of megabytes.
@@ -40,7 +40,7 @@ _MEANINGS = {
 
 def curves(lines: Sequence[tuple[str, Array]], plane: Plane, kind: str = "line thin") -> list[Drawn]:
     """Return named lines (n, 2), degrees or metres, as curves that show their names while the pointer is on them."""
-    return [Curve(kind, path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
+    return [Curve(kind, path([plane(line)], close=False, digits=3), hover=name) for name, line in lines]
 
 
 def line_labels(lines: Sequence[tuple[str, Array]], plane: Plane) -> list[Drawn]:
@@ -91,8 +91,8 @@ def ellipses(marks: Spots, plane: Plane) -> list[Drawn]:
         ("ring local", [ring for ring, bare in zip(marks.rings, local, strict=True) if bare]),
     ):
         lines = [plane(plane.nearest(ring)) for ring in rings if len(ring)]
-        tell = "local ellipse: not valid as 95 % region" if kind == "ring local" else ""
-        drawn += [Curve(kind, path(lines, close=True, digits=_DIGITS), tell=tell)] if lines else []
+        hover = "local ellipse: not valid as 95 % region" if kind == "ring local" else ""
+        drawn += [Curve(kind, path(lines, close=True, digits=_DIGITS), hover=hover)] if lines else []
     return drawn
 
 
@@ -107,7 +107,7 @@ def trails(marks: Spots, plane: Plane) -> list[Drawn]:
         gaps = np.flatnonzero(~known)
         parts = [points[a + 1 : b] for a, b in pairwise([-1, *gaps.tolist(), len(points)]) if b - a > 2]
         if parts:
-            found.append(Curve("trail", path(parts, close=False, digits=3), tell=f"trail of {name}" if name else ""))
+            found.append(Curve("trail", path(parts, close=False, digits=3), hover=f"trail of {name}" if name else ""))
     return found
 
 

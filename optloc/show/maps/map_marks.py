@@ -1,4 +1,4 @@
-"""Marks of fixes, tracks and stations on interactive maps, with the rows of the list beside the map."""
+"""Marks of fixes, tracks and stations on interactive maps, with the rows of the list of positions."""
 
 from __future__ import annotations
 
@@ -192,12 +192,10 @@ def fixed_spots(
 def _statuses(fix: Fix) -> list[tuple[str, str, bool]]:
     """Return status, reason, and whether there is no redundancy, for each position of fixes, in their order."""
     flat = fix if len(fix.shape) == 1 else fix.flat()
-    found = []
-    for position, _, _ in states_of(fix):
-        # A run has several positions for each fix.
-        for i in np.repeat(np.arange(len(flat)), len(position) // len(flat)).tolist():
-            found.append((Status(int(flat.code[i])).label, str(flat.reason[i]), bool(flat.unchecked[i])))
-    return found
+    alone = np.ravel(flat.unchecked)
+    each = [(Status(int(flat.code[i])).label, str(flat.reason[i]), bool(alone[i])) for i in range(len(flat))]
+    # A run has several positions for each fix.
+    return [one for position, _, _ in states_of(fix) for one in each for _ in range(len(position) // len(flat))]
 
 
 def map_row(

