@@ -157,7 +157,7 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
 
             marks = results_of(found).marks()
             labels, times = [mark.name for mark in marks], [mark.time for mark in marks]
-            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, times))
+            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, times=times))
 
 
 def draw(found: FileFixes, path: Path) -> None:

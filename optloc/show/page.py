@@ -48,8 +48,6 @@ class PagePart:
         Text of a study file, folded until the reader opens it.
     note : str
         A paragraph in small print.
-    answer : str
-        HTML of an answer above the maps. It is not escaped, so its writer must escape all texts.
     """
 
     name: str
@@ -63,7 +61,6 @@ class PagePart:
     folded: Sequence[Sheet] = ()
     source: str = ""
     note: str = ""
-    answer: str = ""
 
     @property
     def moving(self) -> bool:

@@ -30,11 +30,10 @@ def test_the_page_of_a_fix_names_its_stations():
 
 def test_a_browser_runs_the_scripts_of_the_page_only():
     problem, fix = ranged()
-    page = fix_page(problem, fix, "Four ranges", answer="<p>the answer</p>")
+    page = fix_page(problem, fix, "Four ranges")
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1].replace("&#39;", "'")
     scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     hashes = [f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'" for text in scripts]
     assert f"script-src {' '.join(hashes)};" in policy
     assert "default-src 'none'" in policy
     assert "connect-src 'none'" in policy
-    assert "<p>the answer</p>" in page

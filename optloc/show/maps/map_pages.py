@@ -45,9 +45,8 @@ def fix_page(
     fixes: Fix | Sequence[Fix],
     title: str,
     labels: Sequence[str] = (),
-    times: Sequence[float] = (),
     *,
-    answer: str = "",
+    times: Sequence[float] = (),
 ) -> str:
     """Return an HTML page with an interactive map of fixes; the page needs no server and no network.
 
@@ -65,8 +64,6 @@ def fix_page(
         Names of the fixes, for instance their epochs.
     times : sequence of float
         Times of the fixes, s.
-    answer : str
-        HTML above the map; it is not escaped.
 
     Raises
     ------
@@ -82,7 +79,7 @@ def fix_page(
     count = sum(fix.code.size for fix in several)
     which = "" if count == 1 else f"{alone if alone < count else 'all'} of {count} fixes: "
     first, shapes = f"{which}{UNCHECKED}." if alone else "", constraint_lines(problem, several)
-    return _marks_page(problem, found, others, title, "fix", single, first, shapes, answer)
+    return _marks_page(problem, found, others, title, "fix", single, first, shapes)
 
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
@@ -162,14 +159,12 @@ def _marks_page(
     single: Fix | None,
     first: str = "",
     shapes: Sequence[tuple[str, Array]] = (),
-    answer: str = "",
 ) -> str:
     """Return the HTML of a page with the map of fixes or tracks.
 
     `marks` are the marks of fixes or scans, and `others` the marks of alternatives. `role` names a mark, "fix" or
     "track". `single` is the fix if there is only one fix, for lines of position. `first` is a paragraph above the map;
-    it may be empty. `shapes` are names and lines (n, 2), degrees or metres, of constraints. `answer` is HTML above the
-    map.
+    it may be empty. `shapes` are names and lines (n, 2), degrees or metres, of constraints.
     """
     flat = not problem.frame.geodetic
     stations, tracks = station_spots(problem), ground_tracks(problem)
@@ -204,7 +199,7 @@ def _marks_page(
     text = first[:1].upper() + first[1:]
     if marks.local is not None and marks.local.any():
         text = " ".join(filter(None, (text, "Dotted: a local ellipse, not valid as 95 % region.")))
-    return write_page(title, [PagePart("map", "Map", text, maps=[canvas], note=_note(flat=flat), answer=answer)])
+    return write_page(title, [PagePart("map", "Map", text, maps=[canvas], note=_note(flat=flat))])
 
 
 def _layers(problem: Problem, marks: Spots, others: Spots, role: str, plane: Plane) -> dict[str, Sequence[Drawn]]:

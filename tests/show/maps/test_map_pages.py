@@ -142,7 +142,7 @@ def test_a_browser_opens_pages_of_many_kinds(tmp_path):
     problem, plane = batch(), optloc.load(DEMO.parent / "ambiguous.toml")
     names, times = [f"pulse {i}" for i in range(200)], 1.7e9 + np.arange(200.0)
     pages = {
-        "batch": fix_page(problem, optloc.solve(problem), "Two hundred fixes", names, times),
+        "batch": fix_page(problem, optloc.solve(problem), "Two hundred fixes", names, times=times),
         "plane": fix_page(plane, optloc.solve(plane), "Two places"),
     }
     for name, text in pages.items():
