@@ -64,7 +64,7 @@ class Label:
 
 
 @dataclass(frozen=True, slots=True)
-class Symbol:
+class StationSymbol:
     """A triangle that marks a station; it has the same size at any zoom.
 
     Parameters
@@ -103,7 +103,7 @@ class Image:
     shape: ClassVar = "image"
 
 
-Drawn = Curve | Label | Symbol | Image
+Drawn = Curve | Label | StationSymbol | Image
 
 
 @dataclass(frozen=True, slots=True)

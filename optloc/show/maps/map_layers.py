@@ -10,12 +10,10 @@ from itertools import pairwise
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.show.maps.canvas import Curve, Drawn, Label, LegendEntry, MapRow, Symbol, dot
-from optloc.show.maps.map_marks import Spots
+from optloc.show.maps.canvas import Curve, Drawn, Label, LegendEntry, MapRow, StationSymbol, dot
+from optloc.show.maps.map_marks import ELLIPSES, Spots
 from optloc.show.maps.projection import Plane, path
 
-# Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file.
-_ELLIPSES = 200
 # Decimals of the units of the drawing: an ellipse of centimetres on a map of 1000 km is still round.
 _DIGITS = 5
 # Size of a mark in pixels, and of a mark if there are more than `_FEW`.
@@ -70,17 +68,17 @@ def station_symbols(names: Sequence[str], places: Array) -> tuple[list[Drawn], l
     Stations without a position on the map have NaN there and are left out.
     """
     known = [(name, x, y) for name, (x, y) in zip(names, places, strict=True) if np.isfinite(x)]
-    symbols: list[Drawn] = [Symbol(x, y, f"station {name}") for name, x, y in known]
+    symbols: list[Drawn] = [StationSymbol(x, y, f"station {name}") for name, x, y in known]
     return symbols, [Label("name", x, y, name) for name, x, y in known]
 
 
 def ellipses(marks: Spots, plane: Plane) -> list[Drawn]:
-    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are more than `_ELLIPSES`.
+    """Return the 95 % ellipses and outlines of marks as curves; nothing if there are more than `ELLIPSES`.
 
     All valid ellipses and outlines are one curve, and all other ellipses another curve. Ellipses that are not valid
     have another class, so that the style sheet draws them dotted. `plane` is the projection of the map.
     """
-    if len(marks.rings) > _ELLIPSES:
+    if len(marks.rings) > ELLIPSES:
         return []
     local = np.zeros(len(marks.rings), dtype=bool) if marks.local is None else marks.local
     covers = [ring for ring, bare in zip(marks.rings, local, strict=True) if not bare]

@@ -21,6 +21,8 @@ from optloc.uncertainty.outline import Outline
 
 # Corners of an ellipse: one for every five degrees; the last corner repeats the first.
 _RING = 73
+ELLIPSES = 200
+"""Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file."""
 SKY = 100e3
 """Height, m, at which space begins by convention. Satellites have no position on a map."""
 # Times from this value on, s, count from 1970, as in the export formats.
@@ -61,7 +63,7 @@ class Spots:
         Longitude and latitude, degrees, or x and y, m; NaN for a missing position.
     rings : tuple of n arrays (r, 2)
         95 % ellipse of each mark, degrees or metres. If no ellipse is valid, the outline of the 95 % region; if there
-        is no covariance, an empty array.
+        is no covariance, or there are more than `ELLIPSES` marks, an empty array.
     clean : bool array (n,)
         Whether the status is `ok`.
     text : tuple of n str
@@ -118,7 +120,7 @@ def spots(
     rings: list[Array] = []
     more: list[Array] = []
     for centre, spread, regions in zip(position, covariance, outlines or [()] * len(position), strict=True):
-        if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+        if len(position) > ELLIPSES or not (np.isfinite(centre).all() and np.isfinite(spread).all()):
             rings.append(np.zeros((0, 2)))
             continue
         # Use the marginal covariance of east and north.

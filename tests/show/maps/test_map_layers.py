@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optloc.show.maps.canvas import Label, MapRow, Symbol
+from optloc.show.maps.canvas import Label, MapRow, StationSymbol
 from optloc.show.maps.map_layers import (
     counted,
     curves,
@@ -78,7 +78,7 @@ def test_a_line_is_shifted_to_the_map():
 
 def test_stations_are_triangles_with_names():
     symbols, names = station_symbols(["A", "sky"], np.array([[1.0, 2.0], [np.nan, np.nan]]))
-    assert symbols == [Symbol(1.0, 2.0, "station A")]
+    assert symbols == [StationSymbol(1.0, 2.0, "station A")]
     assert names == [Label("name", 1.0, 2.0, "A")]
 
 

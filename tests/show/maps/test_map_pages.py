@@ -98,6 +98,8 @@ def test_a_live_page_requests_its_own_server_only():
 _OUTSIDE = """(() => { const box = document.querySelector('.map .sheet').getBoundingClientRect();
   return [...document.querySelectorAll('.map .sheet .dot')].filter(dot => { const b = dot.getBoundingClientRect();
     return b.x < box.x || b.x > box.right || b.y < box.y || b.y > box.bottom; }).length; })()"""
+_MARK = """(() => { const b = document.querySelector('[data-layer=fix] .dot').getBoundingClientRect();
+  return [b.x + b.width / 2, b.y + b.height / 2]; })()"""
 _KEY = (
     "document.querySelector('.map .sheet').dispatchEvent(new KeyboardEvent('keydown', {{ key: '{}', bubbles: true }}))"
 )
@@ -164,6 +166,40 @@ def test_a_browser_opens_pages_of_many_kinds(tmp_path):
             assert browser.run(f"document.querySelectorAll('[data-layer={layer}] [data-row]').length") == marks
             assert browser.run("document.querySelectorAll('.list li').length") == rows
             assert browser.run(_OUTSIDE) == 0
+
+
+@NEEDS_BROWSER
+@pytest.mark.slow
+def test_fingers_move_the_map_and_select_a_mark(tmp_path):
+    problem, fix = ranged()
+    path = tmp_path / "fix.html"
+    path.write_text(fix_page(problem, fix, "Four ranges"), encoding="utf-8")
+    with Browser() as browser:
+        browser.open(path, 390, 844, phone=True)
+        browser.ask("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+
+        def touch(kind, *points):
+            fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+            browser.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=fingers)
+
+        whole = browser.run(_VIEW)
+        touch("Start", (200, 400))
+        touch("Move", (250, 420))
+        touch("End")
+        moved = browser.run(_VIEW)
+        assert moved[0] < whole[0]
+        assert moved[2] == whole[2]
+        touch("Start", (170, 400))
+        touch("Start", (170, 400), (230, 400))
+        touch("Move", (140, 400), (260, 400))
+        touch("End")
+        assert browser.run(_VIEW)[2] == pytest.approx(0.5 * whole[2])
+        browser.run("document.querySelector('[data-do=all]').click()")
+        x, y = browser.run(_MARK)
+        touch("Start", (x + 6, y))  # a finger is wider than a mark
+        touch("End")
+        assert browser.run("document.querySelectorAll('.list .picked').length") == 1
+        assert browser.messages == []
 
 
 @NEEDS_BROWSER
