@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -217,11 +216,9 @@ def test_fixes_appear_on_the_map_in_a_browser(site, served):
     for i, row in enumerate(differences(site, arrivals(site, 2)).tolist()):
         ask(port, "POST", "/fix", line(event=f"shown {i}", z=row, target="<b>here</b>"))
     with Browser() as browser:
-        readable(browser, f"http://127.0.0.1:{port}/", "live")
-        texts = "[...document.querySelectorAll('.list li')].map(row => row.innerText.trim())"
-        until = time.monotonic() + 30.0
-        while not (told := browser.run(texts)) and time.monotonic() < until:
-            time.sleep(0.1)
+        shown = "[...document.querySelectorAll('.list li')].some(row => row.innerText.includes('here'))"
+        readable(browser, f"http://127.0.0.1:{port}/", "live", ready=shown)
+        told = browser.run("[...document.querySelectorAll('.list li')].map(row => row.innerText.trim())")
         assert any(text.startswith("<b>here</b> ok") and "\n47.5" in text for text in told), told
         assert browser.run("document.querySelectorAll('[data-layer=trails] path').length") == 1
         assert browser.run("document.querySelector('.link').textContent").startswith("Connected, last event")

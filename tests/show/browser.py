@@ -157,12 +157,22 @@ _COVERED = """(() => {
 })()"""
 
 
-def readable(browser, path, name):
-    """Open a page at both widths and in both themes, keep pictures, and check that every text is readable."""
+# Two pictures of the screen: a map lays its labels before the second.
+_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
+
+
+def readable(browser, path, name, ready="true"):
+    """Open a page at both widths and in both themes, keep pictures, and check that every text is readable.
+
+    The page is complete when the JavaScript expression `ready` is true.
+    """
     for width, phone in ((1280, False), (390, True)):
         for dark in (False, True):
             browser.open(path, width, 844, phone=phone, dark=dark)
-            browser.run("new Promise(done => setTimeout(done, 300))")
+            end = time.monotonic() + PATIENCE
+            while not browser.run(ready) and time.monotonic() < end:
+                time.sleep(0.1)
+            browser.run(_DRAWN)
             case = f"{name}-{width}{'-dark' if dark else ''}"
             kept(browser, case)
             assert browser.messages == [], case
