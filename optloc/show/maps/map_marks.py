@@ -153,7 +153,11 @@ def map_places(problem: Problem, position: Array) -> Array:
 
 
 def fixed_spots(
-    problem: Problem, fixes: Sequence[Fix], labels: Sequence[str] = (), times: Sequence[float] = ()
+    problem: Problem,
+    fixes: Sequence[Fix],
+    labels: Sequence[str] = (),
+    times: Sequence[float] = (),
+    targets: Sequence[str] = (),
 ) -> Spots:
     """Return the marks of fixes.
 
@@ -167,6 +171,8 @@ def fixed_spots(
         Names of the positions; ignored if their number is another.
     times : sequence of float
         Times of the positions, s; ignored if their number is another.
+    targets : sequence of str
+        Targets of the positions, each of which has its trail; by default one target.
     """
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -187,7 +193,8 @@ def fixed_spots(
     local = is_local(fixes, [bool(each) for each in outlines], count)
     # The positions of a run form a trail. Fixes that are independent of each other form one if their times are known.
     together = len(fixes) == 1 and fixes[0].code.size == 1
-    trail = ("",) * count if together or np.isfinite(when).all() else ()
+    owners = tuple(targets) if len(targets) == count else ("",) * count
+    trail = owners if together or np.isfinite(when).all() else ()
     return replace(found, local=local, rows=rows, groups=trail)
 
 

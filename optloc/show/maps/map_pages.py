@@ -47,6 +47,7 @@ def fix_page(
     labels: Sequence[str] = (),
     *,
     times: Sequence[float] = (),
+    targets: Sequence[str] = (),
 ) -> str:
     """Return an HTML page with an interactive map of fixes; the page needs no server and no network.
 
@@ -64,6 +65,8 @@ def fix_page(
         Names of the fixes, for instance their epochs.
     times : sequence of float
         Times of the fixes, s.
+    targets : sequence of str
+        Targets of the fixes, each of which has its trail; by default one target.
 
     Raises
     ------
@@ -71,7 +74,7 @@ def fix_page(
         If nothing has a position, or matplotlib is missing.
     """
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
-    found, others = fixed_spots(problem, several, labels, times), other_spots(problem, several)
+    found, others = fixed_spots(problem, several, labels, times, targets), other_spots(problem, several)
     # Lines of position need a single fix.
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
     # Number of fixes without redundancy.

@@ -99,6 +99,7 @@ const drawGrid = (layer, data, area, unit) => {
   const turned = lon => ((lon + 540) % 360 + 360) % 360 - 180;
   const sayDegrees = (value, names) => `${Math.abs(value)}°${value ? ` ${names[value > 0 ? 0 : 1]}` : ""}`;
   const along = (low, high, start, size, put) => {
+    if (!(high - low < 60 * size)) return; // degrees of longitude near a pole
     for (let k = Math.ceil((low - start) / size); start + k * size < high; k += 1) put(k, start + k * size);
   };
   const sizes = degrees ? [step * data.scale[0], step * -data.scale[1]] : [length * perMetre, length * perMetre];

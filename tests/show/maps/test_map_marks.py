@@ -69,6 +69,13 @@ def test_a_row_has_status_time_and_coordinates():
     assert row.size.endswith("north")
 
 
+def test_each_target_has_its_trail():
+    problem, fix = ranged()
+    assert fixed_spots(problem, [fix, fix]).groups == ()  # the order of these fixes is unknown
+    assert fixed_spots(problem, [fix, fix], times=[0.0, 1.0]).groups == ("", "")
+    assert fixed_spots(problem, [fix, fix], times=[0.0, 1.0], targets="ab").groups == ("a", "b")
+
+
 def test_an_unknown_position_has_no_coordinates():
     (row,) = fixed_spots(ranged()[0], [unbounded()]).rows
     assert row.status == "unbounded"
