@@ -156,9 +156,10 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
             from optloc.show.maps.map_pages import fix_page
 
             marks = results_of(found).marks()
-            named = {"times": [mark.time for mark in marks], "targets": [mark.target for mark in marks]}
-            labels = [mark.name for mark in marks]
-            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, **named))
+            labels, times = [mark.name for mark in marks], [mark.time for mark in marks]
+            targets = [mark.target for mark in marks]
+            problem, title = found.loaded.problem, found.loaded.title
+            write_text(html, fix_page(problem, (found.fix,), title, labels, times=times, targets=targets))
 
 
 def draw(found: FileFixes, path: Path) -> None:
