@@ -98,6 +98,10 @@ def test_a_live_page_requests_its_own_server_only():
 _OUTSIDE = """(() => { const box = document.querySelector('.map .sheet').getBoundingClientRect();
   return [...document.querySelectorAll('.map .sheet .dot')].filter(dot => { const b = dot.getBoundingClientRect();
     return b.x < box.x || b.x > box.right || b.y < box.y || b.y > box.bottom; }).length; })()"""
+_CENTRE = """(() => { const sheet = document.querySelector('.map .sheet');
+  sheet.scrollIntoView({ block: 'center' });
+  const b = sheet.getBoundingClientRect();
+  return [b.x + b.width / 2, b.y + b.height / 2]; })()"""
 _MARK = """(() => { const b = document.querySelector('[data-layer=fix] .dot').getBoundingClientRect();
   return [b.x + b.width / 2, b.y + b.height / 2]; })()"""
 _KEY = (
@@ -183,15 +187,16 @@ def test_fingers_move_the_map_and_select_a_mark(tmp_path):
             browser.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=fingers)
 
         whole = browser.run(_VIEW)
-        touch("Start", (200, 400))
-        touch("Move", (250, 420))
+        x, y = browser.run(_CENTRE)
+        touch("Start", (x, y))
+        touch("Move", (x + 50, y + 20))
         touch("End")
         moved = browser.run(_VIEW)
         assert moved[0] < whole[0]
         assert moved[2] == whole[2]
-        touch("Start", (170, 400))
-        touch("Start", (170, 400), (230, 400))
-        touch("Move", (140, 400), (260, 400))
+        touch("Start", (x - 30, y))
+        touch("Start", (x - 30, y), (x + 30, y))
+        touch("Move", (x - 60, y), (x + 60, y))
         touch("End")
         assert browser.run(_VIEW)[2] == pytest.approx(0.5 * whole[2])
         browser.run("document.querySelector('[data-do=all]').click()")
