@@ -437,7 +437,7 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     if ending == ".geojson":
         write_text(out, dumps(map_geojson(found)))
         return
-    from optloc.show.page import map_page
+    from optloc.show.maps.bound_page import map_page
 
     write_text(out, map_page(found, title))
 

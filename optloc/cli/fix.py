@@ -146,11 +146,16 @@ def _write(
         if plot is not None:
             draw(found, plot)
         if html is not None:
-            from optloc.show.page import LISTED, fix_page
+            from optloc.show.maps.map_pages import fix_page
+            from optloc.show.page import LISTED
 
-            labels = [str(label) for label in found.columns["epoch"]]
+            marks = results_of(found).marks()
+            labels, times = [mark.name for mark in marks], [mark.time for mark in marks]
+            targets = [mark.target for mark in marks]
+            problem, title = found.loaded.problem, found.loaded.title
             answer = answer_of_file(found, advice, LISTED)
-            write_text(html, fix_page(found.loaded.problem, (found.fix,), found.loaded.title, labels, answer))
+            page = fix_page(problem, (found.fix,), title, labels, times=times, targets=targets, answer=answer)
+            write_text(html, page)
 
 
 def draw(found: FileFixes, path: Path) -> None:

@@ -270,7 +270,7 @@ Out = Annotated[
 Html = Annotated[
     Path | None,
     typer.Option(
-        "--html", metavar="OUT.html", help="Write an HTML page with an interactive map; geodetic frames only."
+        "--html", metavar="OUT.html", help="Write an HTML page with an interactive map and a list of the positions."
     ),
 ]
 Allow = Annotated[

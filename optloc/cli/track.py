@@ -296,22 +296,18 @@ def track_columns(one: TargetTrack) -> Columns:
 
 def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     """Return an HTML page with the map of the tracks `ones`."""
-    from optloc.show.map import degrees, sentence, spots
-    from optloc.show.page import track_page
+    from optloc.show.maps.map_marks import scan_spots
+    from optloc.show.maps.map_pages import track_page
 
-    problem, d = loaded.problem, loaded.problem.dimension
+    d = loaded.problem.dimension
     entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]
     position = np.stack([e.updated.mean[:d] for _, _, e in entries])
     covariance = np.stack([e.updated.cov[:d, :d] for _, _, e in entries])
     clean = np.array([e.label in _CLEAN for _, _, e in entries])
-    sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
-    place = degrees(problem, position) if problem.frame.geodetic else position
-    names = [f"{name} {label}" if len(ones) > 1 else label for name, label, _ in entries]
-    text = [
-        sentence(name, e.label, *values)
-        for name, (_, _, e), values in zip(names, entries, zip(place, sigma, strict=True), strict=True)
+    scans = [
+        (name, f"{name} {label}" if len(ones) > 1 else label, e.time, e.label, e.reason) for name, label, e in entries
     ]
-    return track_page(problem, spots(problem, position, covariance, clean, text), loaded.title)
+    return track_page(loaded.problem, scan_spots(loaded.problem, position, covariance, scans, clean), loaded.title)
 
 
 def _write(

@@ -7,6 +7,7 @@ fix, the second phase gives the proof.
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from time import time
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
-from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, mark_of
+from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, live_mark, mark_of
 from optloc.tracking import Entry
 
 Record = dict[str, Any]
@@ -30,6 +31,8 @@ UNNAMED = "target"
 
 # Seconds after which a target is removed from the list; maps of aircraft use this limit.
 _MAX_AGE = 60.0
+# Positions of a trail: two minutes of one fix a second, few enough for a feed that is read once a second.
+_TRAIL = 120
 
 
 def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Record]:
@@ -327,6 +330,11 @@ class Latest:
         self._most, self._total = most, 0  # `_total` counts the stored fixes since the start
         # by name of the target or event, the oldest first: time of the fix (s since 1970) and record
         self._held: dict[str, tuple[float, Record]] = {}
+        # by name of the target: its latest positions, the oldest first, for trails
+        self._trails: dict[str, deque[list[float]]] = {}
+        # by name of the target: the record of the last request for marks, and its mark
+        self._drawn: dict[str, tuple[Record, Record]] = {}
+        self._last: float | None = None  # time of the last answer to an event, s since 1970
 
     def __call__(self, record: Record) -> None:
         """Store a record if it has a position, or add it to the stored record of the same event.
@@ -335,19 +343,28 @@ class Latest:
         """
         if "event" not in record or "note" in record:
             return
+        self._last = time()
         name = record.get("target") or record["event"]
         old = self._held.get(name)
         if old is not None and old[1]["event"] == record["event"]:
             self._held[name] = (old[0], join(old[1], record))
+            if record.get("position") is not None:
+                self._trails[name][-1] = record["position"]
             return
         if record.get("position") is None:
             return
         # Each step is one call of a built-in: a reader in another thread gets the old or the new record.
         self._held.pop(name, None)
         self._held[name] = (time(), join(None, record))
+        if old is None or time() - old[0] > _MAX_AGE:  # a target that returns starts a new trail
+            self._trails[name] = deque(maxlen=_TRAIL)
+        self._trails[name].append(record["position"])
         self._total += 1
         if len(self._held) > self._most:
-            self._held.pop(next(iter(self._held)), None)
+            gone = next(iter(self._held))
+            self._held.pop(gone, None)
+            self._trails.pop(gone, None)
+            self._drawn.pop(gone, None)
 
     def _present(self) -> list[tuple[float, Record]]:
         """Return the age (s) and the record of each target with a fix in the last minute."""
@@ -357,6 +374,24 @@ class Latest:
     def features(self) -> Record:
         """Return the latest fixes as a GeoJSON feature collection."""
         return {"type": "FeatureCollection", "features": [to_feature(record) for _, record in self._present()]}
+
+    def marks(self, frame: Frame) -> Record:
+        """Return the latest fixes for the live map: `now` and `last` event (s since 1970, None without one), `fixes`.
+
+        `frame` is the frame of the site. For the keys of a fix see `optloc.show.live_mark`; `received` is its time of
+        arrival, s since 1970.
+        """
+        now, found = time(), []
+        for age, record in self._present():
+            name = record.get("target") or record["event"]
+            drawn = self._drawn.get(name)
+            # A stored record is never changed, only replaced: the same object has the same mark.
+            if drawn is None or drawn[0] is not record:
+                trail = [np.array(place) for place in list(self._trails.get(name, ()))]
+                mark = live_mark(frame, to_mark(record, frame), trail) | {"received": round(now - age, 3)}
+                drawn = self._drawn[name] = (record, _finite(mark))
+            found.append(drawn[1])
+        return {"now": round(now, 3), "last": self._last, "fixes": found}
 
     def aircraft(self) -> Record:
         """Return the latest fixes as readsb's ``aircraft.json``."""

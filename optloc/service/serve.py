@@ -30,6 +30,13 @@ _CONNECTIONS, _QUEUE = 256, 1024
 # Permitted host names of local requests. Another name may come from a web page of a stranger whose domain name resolves
 # to this machine (DNS rebinding).
 _NAMES = ("localhost", "127.0.0.1", "::1", "[::1]")
+# Headers of the page. No other page may show it in a frame; the page itself has a stricter Content-Security-Policy.
+_SAFE = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 
 
 def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Callable[[], None]]:
@@ -98,10 +105,14 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     async def aircraft(_: Any) -> Any:
         return JSONResponse(stream.latest.aircraft())
 
+    async def marks(_: Any) -> Any:
+        # In a thread, because many new fixes take some milliseconds.
+        return JSONResponse(await asyncio.to_thread(stream.latest.marks, stream.site.frame))
+
     async def page(_: Any) -> Any:
-        """Return the page with the map; status 404 for a site that is not on Earth."""
+        """Return the page with the map; status 404 without a station on the map."""
         try:
-            return HTMLResponse(await asyncio.to_thread(page_of, stream.site))
+            return HTMLResponse(await asyncio.to_thread(page_of, stream.site), headers=_SAFE)
         except InvalidProblem as error:
             return PlainTextResponse(f"{error}\n", 404)
 
@@ -114,6 +125,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
         Route("/health", health),
         Route("/metrics", metrics),
         Route("/fixes.geojson", fixes),
+        Route("/map.json", marks),
         Route("/data/aircraft.json", aircraft),
         WebSocketRoute("/ws", listen),
     ]
@@ -179,7 +191,7 @@ def _line_routes(stream: Stream) -> list[Any]:
 
 
 def page_of(site: Site) -> str:
-    """Return the page with the map of a site; raise InvalidProblem for a site that is not on Earth."""
+    """Return the page with the map of a site; raise InvalidProblem if no station has a position on the map."""
     from optloc.show import live_page
 
     ready = site.ready((), site.rows)

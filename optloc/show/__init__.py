@@ -23,16 +23,11 @@ if TYPE_CHECKING:
     )
     from optloc.show.formats import FORMATS as FORMATS, write_fixes as write_fixes
     from optloc.show.formats.marks import Mark as Mark, Other as Other, mark_of as mark_of
-    from optloc.show.map import Canvas as Canvas
-    from optloc.show.page import (
-        PagePart as PagePart,
-        fix_page as fix_page,
-        live_page as live_page,
-        map_element as map_element,
-        map_page as map_page,
-        track_page as track_page,
-        write_page as write_page,
-    )
+    from optloc.show.maps.bound_page import map_element as map_element, map_page as map_page
+    from optloc.show.maps.canvas import Canvas as Canvas
+    from optloc.show.maps.live_marks import live_mark as live_mark
+    from optloc.show.maps.map_pages import fix_page as fix_page, live_page as live_page, track_page as track_page
+    from optloc.show.page import PagePart as PagePart, write_page as write_page
     from optloc.show.pictures.bound_map import (
         COLOURS as COLOURS,
         levels as levels,

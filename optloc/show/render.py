@@ -90,12 +90,11 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.globals["asset"] = _asset
     made.filters["visible"] = visible
     made.globals["text_columns"] = TEXT_COLUMNS
     return made
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
     """Return a style sheet or a script as text; its braces must not be parsed as template syntax."""
     return (files("optloc.show") / "templates" / name).read_text(encoding="utf-8")

@@ -87,3 +87,19 @@ def test_the_latest_fix_of_each_target_is_kept_and_the_oldest_leave():
     assert [feature["properties"]["event"] for feature in found] == ["b", "c"]
     assert found[1]["properties"]["proof"] == "global"
     assert latest.aircraft()["messages"] == 3
+
+
+def test_marks_have_trails_of_their_targets():
+    latest = Latest()
+    assert latest.marks(ECEF) | {"now": 0.0} == {"now": 0.0, "last": None, "fixes": []}
+    for i in range(3):
+        place = [FIX["position"][0] + 10.0 * i, *FIX["position"][1:]]
+        latest(FIX | {"event": f"e{i}", "target": "T", "position": place})
+    latest({"event": "e2", "phase": "proof", "status": "ok", "target": "T", "proof": "global"})
+    found = latest.marks(ECEF)
+    (mark,) = found["fixes"]
+    assert (mark["name"], mark["status"], len(mark["trail"])) == ("T", "ok", 3)
+    assert mark["trail"][-1] == mark["at"]
+    assert found["last"] <= found["now"]
+    assert latest.marks(ECEF)["fixes"][0] is mark  # only new fixes are computed
+    json.dumps(found, allow_nan=False)

@@ -2,13 +2,12 @@
 
 import http.client
 import json
-import time
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from service.lines import SITE, Answers, arrivals, differences, line, site_in, solved
-from show.browser import Browser, executable
+from show.browser import Browser, executable, readable
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -204,7 +203,7 @@ def test_the_map_needs_no_network(served):
     code, _, page = ask(port, "GET", "/")
     assert code == 200
     assert "station A" in page
-    assert "fixes.geojson" in page
+    assert "map.json" in page
     outside = [
         word for word in ("http://", "https://", "//cdn", "@import") if word in page.replace("http://www.w3.org", "")
     ]
@@ -214,16 +213,16 @@ def test_the_map_needs_no_network(served):
 @pytest.mark.skipif(executable() is None, reason="needs chromium (Debian's package of that name)")
 def test_fixes_appear_on_the_map_in_a_browser(site, served):
     _, port = served
-    row = differences(site, arrivals(site, 1))[0].tolist()
-    ask(port, "POST", "/fix", line(event="shown", z=row, target="<b>here</b>"))
+    for i, row in enumerate(differences(site, arrivals(site, 2)).tolist()):
+        ask(port, "POST", "/fix", line(event=f"shown {i}", z=row, target="<b>here</b>"))
     with Browser() as browser:
-        browser.ask("Page.navigate", url=f"http://127.0.0.1:{port}/")
-        dots = "[...document.querySelectorAll('[data-layer=fixes] .dot')].map(dot => dot.dataset.tell)"
-        until = time.monotonic() + 30.0
-        while not (told := browser.run(dots)) and time.monotonic() < until:
-            time.sleep(0.1)
-        assert any(text.startswith("<b>here</b>, ok, 47.5") for text in told)
-        assert browser.run("document.querySelectorAll('b').length") == 0
+        shown = "[...document.querySelectorAll('.list li')].some(row => row.innerText.includes('here'))"
+        readable(browser, f"http://127.0.0.1:{port}/", "live", ready=shown)
+        told = browser.run("[...document.querySelectorAll('.list li')].map(row => row.innerText.trim())")
+        assert any(text.startswith("<b>here</b> ok") and "\n47.5" in text for text in told), told
+        assert browser.run("document.querySelectorAll('[data-layer=trails] path').length") == 1
+        assert browser.run("document.querySelector('.link').textContent").startswith("Connected, last event")
+        assert browser.run("document.querySelectorAll('b b').length") == 0
         assert browser.messages == []
         assert {urlsplit(url).netloc for url in browser.requests} == {f"127.0.0.1:{port}"}
 

@@ -18,6 +18,13 @@ def executable():
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
+def kept(browser, name):
+    """Write a picture of the whole page into the folder of the variable OPTLOC_SCREENSHOTS, if there is one."""
+    if folder := os.environ.get("OPTLOC_SCREENSHOTS"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        browser.picture(Path(folder) / f"{name}.png", whole=True)
+
+
 class Browser:
     """One browser with one tab; `messages` are its complaints: console errors, exceptions, requests to a network."""
 
@@ -98,11 +105,15 @@ class Browser:
         elif method == "Network.requestWillBeSent" and not what["request"]["url"].startswith("data:"):
             self.requests.append(what["request"]["url"])
 
-    def open(self, path, width=1280, height=900, *, phone=False):
-        """Open a file and wait until it is loaded."""
+    def open(self, path, width=1280, height=900, *, phone=False, dark=False, scripts=True):
+        """Open a file or an address and wait until it is loaded; without `scripts`, the page runs none of its own."""
         self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.ask("Emulation.setEmulatedMedia", features=[theme])
+        self.ask("Emulation.setScriptExecutionDisabled", value=not scripts)
         self.events.clear()
-        self.ask("Page.navigate", url=Path(path).resolve().as_uri())
+        url = path if str(path).startswith("http") else Path(path).resolve().as_uri()
+        self.ask("Page.navigate", url=url)
         end = time.monotonic() + PATIENCE
         while "Page.loadEventFired" not in self.events:
             assert time.monotonic() < end, "the page does not load"
@@ -122,3 +133,50 @@ class Browser:
     def pdf(self):
         """Return the page as it is printed."""
         return base64.b64decode(self.ask("Page.printToPDF", printBackground=True)["data"])
+
+
+# Texts that a reader sees: size on the screen with the scale of the drawing, texts that are wider than their box, and
+# labels of the map that cover each other.
+TOO_SMALL = """(() => {
+  const seen = e => e.textContent.trim() && e.checkVisibility({ visibilityProperty: true }) && !e.children.length;
+  const scale = e => e.tagName === 'text' ? e.getScreenCTM().a : 1;
+  const size = e => parseFloat(getComputedStyle(e).fontSize) * scale(e);
+  const parts = [...document.querySelectorAll('body *')].filter(e => !/^(script|style|title|desc)$/i.test(e.tagName));
+  return parts.filter(e => seen(e) && size(e) < 9).map(e => `${e.tagName} ${e.textContent.slice(0, 20)} ${size(e)}`);
+})()"""
+_CLIPPED = """(() => {
+  const parts = document.querySelectorAll('code, .status, .size, .copy, .key li, .layers label, output, p, h1, h2');
+  const wide = e => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline';
+  return [...parts].filter(wide).map(e => e.textContent.slice(0, 30));
+})()"""
+_COVERED = """(() => {
+  const labels = [...document.querySelectorAll('.map text:not(.off)')].filter(e => e.checkVisibility());
+  const boxes = labels.map(e => e.getBoundingClientRect());
+  const meet = (a, b) => a.x < b.right - 2 && b.x < a.right - 2 && a.y < b.bottom - 4 && b.y < a.bottom - 4;
+  return boxes.filter((a, i) => boxes.some((b, j) => j < i && meet(a, b))).length;
+})()"""
+
+
+# Two pictures of the screen: a map lays its labels before the second.
+_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
+
+
+def readable(browser, path, name, ready="true"):
+    """Open a page at both widths and in both themes, keep pictures, and check that every text is readable.
+
+    The page is complete when the JavaScript expression `ready` is true.
+    """
+    for width, phone in ((1280, False), (390, True)):
+        for dark in (False, True):
+            browser.open(path, width, 844, phone=phone, dark=dark)
+            end = time.monotonic() + PATIENCE
+            while not browser.run(ready) and time.monotonic() < end:
+                time.sleep(0.1)
+            browser.run(_DRAWN)
+            case = f"{name}-{width}{'-dark' if dark else ''}"
+            kept(browser, case)
+            assert browser.messages == [], case
+            assert browser.run("document.documentElement.scrollWidth") <= width, case
+            assert browser.run(TOO_SMALL) == [], case
+            assert browser.run(_CLIPPED) == [], case
+            assert browser.run(_COVERED) == 0, case

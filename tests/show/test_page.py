@@ -1,14 +1,14 @@
-"""Pages: one file that needs nothing else, limits of maps on the shorter way, and names that are no HTML."""
+"""Pages: one file that needs nothing else, runs its own scripts only, and shows names that are no HTML."""
 
 import re
+from base64 import b64encode
+from hashlib import sha256
 
-import numpy as np
 import pandas as pd
-import pytest
 from show.ranging import ranged
 
-from optloc import InvalidProblem
-from optloc.show.page import PagePart, _map_limits, _shift_near, fix_page, write_page
+from optloc.show.maps.map_pages import fix_page
+from optloc.show.page import PagePart, write_page
 from optloc.show.sheet import Sheet, TextTable
 
 
@@ -28,18 +28,12 @@ def test_the_page_of_a_fix_names_its_stations():
     assert "<title>Four ranges</title>" in page
 
 
-def test_a_map_goes_the_shorter_way_around_the_earth():
-    west, east, south, north = _map_limits([np.array([[179.0, 10.0], [-179.0, 12.0]])])
-    assert west < 179.0
-    assert 181.0 < east < 190.0
-    assert south < 10.0
-    assert north > 12.0
-    with pytest.raises(InvalidProblem, match="nothing has a position"):
-        _map_limits([np.full((1, 2), np.nan)])
-
-
-def test_longitudes_are_within_half_a_turn_of_the_middle():
-    place = np.array([[-170.0, 1.0], [170.0, 2.0], [539.0, 3.0]])
-    found = _shift_near(place, 175.0)
-    assert found[:, 0] == pytest.approx([190.0, 170.0, 179.0])
-    assert found[:, 1].tolist() == [1.0, 2.0, 3.0]
+def test_a_browser_runs_the_scripts_of_the_page_only():
+    problem, fix = ranged()
+    page = fix_page(problem, fix, "Four ranges")
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1].replace("&#39;", "'")
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    hashes = [f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'" for text in scripts]
+    assert f"script-src {' '.join(hashes)};" in policy
+    assert "default-src 'none'" in policy
+    assert "connect-src 'none'" in policy

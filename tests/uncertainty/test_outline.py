@@ -13,7 +13,7 @@ from optloc.cli.file_fixes import fix_file, results_of
 from optloc.files import read
 from optloc.problem.chart import quantile
 from optloc.show.formats.marks import geojson
-from optloc.show.map import fixed_spots
+from optloc.show.maps.map_marks import fixed_spots
 from optloc.show.pictures import plot_fixes
 from optloc.show.pictures.outlines import outlines_of
 from optloc.uncertainty.contour import holds

@@ -1,78 +1,105 @@
-"use strict";
-// Maps: dragging, the wheel, pinching and buttons move a map. A pointer or a tap shows the text of a mark, else the bound or
-// the position.
-for (const map of document.querySelectorAll(".map")) {
-  const svg = map.querySelector("svg"), out = map.querySelector("output"), help = out.textContent;
+// Maps: dragging, the wheel, pinching, keys and buttons move a map. A pointer or a tap shows the text of a mark, else the
+// bound or the position.
+
+const openMap = map => {
+  const sheet = map.querySelector(".sheet"), out = map.querySelector("output"), help = out.textContent;
   const data = JSON.parse(map.querySelector("script").textContent);
-  const whole = svg.getAttribute("viewBox").split(" ").map(Number);
-  let view = [...whole];
+  const whole = sheet.getAttribute("viewBox").split(" ").map(Number);
+  const grid = sheet.querySelector('[data-layer="grid"]'), bar = map.querySelector(".scale");
+  let view = [...whole], kept = help, waiting = false;
   const unit = () => {
-    const { width, height } = svg.getBoundingClientRect();
+    const { width, height } = sheet.getBoundingClientRect();
     return Math.max(view[2] / Math.max(width, 1), view[3] / Math.max(height, 1));
   };
-  const bar = map.querySelector(".scale");
-  // The longest length of 1, 2, 5, 10, ... metres that fits in 120 pixels; a degree of latitude is 111.2 km long.
-  const measure = () => {
-    const metres = unit() * 111195 / Math.abs(data.scale[1]), most = 120 * metres;
-    const power = 10 ** Math.floor(Math.log10(most)), length = power * [5, 2, 1].find(n => n * power <= most);
-    bar.style.width = `${length / metres}px`;
-    bar.textContent = length >= 1000 ? `${length / 1000} km` : length >= 1 ? `${length} m` : `${+(length * 100).toFixed(2)} cm`;
+  const area = u => {
+    const { width, height } = sheet.getBoundingClientRect(), x = view[0] + view[2] / 2, y = view[1] + view[3] / 2;
+    return [x - width * u / 2, y - height * u / 2, x + width * u / 2, y + height * u / 2];
+  };
+  const measure = u => {
+    const perMetre = Math.abs(data.scale[1]) / (data.flat ? 1 : 111195), length = round125(140 * u / perMetre);
+    bar.style.width = `${length * perMetre / u}px`;
+    bar.textContent = metreText(length);
     // Shores are inaccurate by kilometres. On a map of a city, the style shows that they are only approximate.
-    svg.classList.toggle("near", metres < 20);
+    sheet.classList.toggle("near", u / perMetre < 20);
+  };
+  // Grid and labels take milliseconds, so they follow once for each picture of the screen.
+  const lay = () => {
+    waiting = false;
+    const u = unit(), visible = area(u);
+    if (grid.style.display !== "none") drawGrid(grid, data, visible, u);
+    layLabels(sheet, visible, u);
   };
   const show = () => {
-    svg.setAttribute("viewBox", view.join(" "));
-    svg.style.setProperty("--unit", unit());
-    svg.classList.toggle("far", view[2] > 1.7 * whole[2]);
-    measure();
+    const u = unit();
+    sheet.setAttribute("viewBox", view.join(" "));
+    sheet.style.setProperty("--unit", u);
+    sheet.classList.toggle("far", view[2] > 2 * whole[2]);
+    measure(u);
+    if (!waiting) { waiting = true; requestAnimationFrame(lay); }
   };
   const place = event => {
-    const box = svg.getBoundingClientRect(), u = unit();
+    const box = sheet.getBoundingClientRect(), u = unit();
     return [view[0] + view[2] / 2 + (event.clientX - box.left - box.width / 2) * u,
       view[1] + view[3] / 2 + (event.clientY - box.top - box.height / 2) * u];
   };
-  const zoom = (by, [x, y] = [view[0] + view[2] / 2, view[1] + view[3] / 2]) => {
+  const centre = () => [view[0] + view[2] / 2, view[1] + view[3] / 2];
+  const zoom = (by, [x, y] = centre()) => {
     const size = Math.min(Math.max(view[2] / by, whole[2] / (data.nearest ?? 200)), whole[2] * 2.5), f = size / view[2];
     view = [x + (view[0] - x) * f, y + (view[1] - y) * f, size, view[3] * f];
     show();
   };
+  const pan = (dx, dy) => { view[0] += dx; view[1] += dy; show(); };
   const where = ([px, py]) => {
-    const lon = data.middle[0] + px / data.scale[0], lat = data.middle[1] + py / data.scale[1];
-    const turned = ((lon + 540) % 360) - 180, digits = data.values ? 4 : 5;
-    const text = `${Math.abs(lat).toFixed(digits)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(digits)}° ${turned < 0 ? "W" : "E"}`;
-    return [lon, lat, text];
+    const x = data.middle[0] + px / data.scale[0], y = data.middle[1] + py / data.scale[1];
+    if (data.flat) {
+      const digits = Math.max(0, Math.ceil(-Math.log10(unit() / data.scale[0])));
+      return [x, y, `x ${x.toFixed(digits)} m, y ${y.toFixed(digits)} m`];
+    }
+    const turned = ((x + 540) % 360) - 180, digits = data.values ? 4 : 5;
+    const text = `${Math.abs(y).toFixed(digits)}° ${y < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(digits)}° ${turned < 0 ? "W" : "E"}`;
+    return [x, y, text];
   };
-  // The text of the mark at a pixel or 6 pixels from it: marks are smaller than fingers.
+  // The mark at a pixel or 8 pixels from it: marks are smaller than fingers.
   const marked = event => {
-    for (const [dx, dy] of [[0, 0], [6, 0], [-6, 0], [0, 6], [0, -6]]) {
+    for (const [dx, dy] of [[0, 0], [8, 0], [-8, 0], [0, 8], [0, -8]]) {
       const mark = document.elementFromPoint(event.clientX + dx, event.clientY + dy)?.closest?.("[data-tell]");
-      if (mark && svg.contains(mark)) return mark.dataset.tell;
+      if (mark && sheet.contains(mark)) return mark;
     }
     return null;
   };
   const tell = event => {
-    const text = marked(event), [lon, lat, at] = where(place(event));
-    if (text !== null || !data.values) { out.textContent = text ?? at; return; }
+    const mark = marked(event), [x, y, at] = where(place(event));
+    if (mark || !data.values) { out.textContent = mark?.dataset.tell ?? at; return; }
     const [x0, x1, nx] = data.x, [y0, y1, ny] = data.y;
-    const i = Math.round((lon - x0) / (x1 - x0) * (nx - 1)), j = Math.round((lat - y0) / (y1 - y0) * (ny - 1));
+    const i = Math.round((x - x0) / (x1 - x0) * (nx - 1)), j = Math.round((y - y0) / (y1 - y0) * (ny - 1));
     const value = i >= 0 && i < nx && j >= 0 && j < ny ? data.values[j * nx + i] : null;
     out.textContent = value === null ? `${at}: no bound here` : `${at}: bound ${value < 1000 ? value + " m" : value / 1000 + " km"}`;
   };
+  const keep = text => { kept = text; out.textContent = text; };
+  // Move the map if a point of the drawing is outside its visible part.
+  const reveal = ([x, y]) => {
+    const [left, top, right, bottom] = area(unit());
+    if (x < left || x > right || y < top || y > bottom) { view[0] = x - view[2] / 2; view[1] = y - view[3] / 2; show(); }
+  };
+  const list = listOf(map, { tell: keep, reveal });
   const fingers = new Map();
+  let start = null;
   const spread = () => {
     const [a, b] = [...fingers.values()];
     return Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
   };
-  svg.addEventListener("pointerdown", event => { svg.setPointerCapture(event.pointerId); fingers.set(event.pointerId, event); });
-  svg.addEventListener("pointermove", event => {
+  sheet.addEventListener("pointerdown", event => {
+    sheet.setPointerCapture(event.pointerId);
+    fingers.set(event.pointerId, event);
+    start = fingers.size === 1 ? event : null;
+  });
+  sheet.addEventListener("pointermove", event => {
     const old = fingers.get(event.pointerId);
     if (!old) { tell(event); return; }
     if (fingers.size === 1) {
       const u = unit();
-      view[0] -= (event.clientX - old.clientX) * u;
-      view[1] -= (event.clientY - old.clientY) * u;
+      pan(-(event.clientX - old.clientX) * u, -(event.clientY - old.clientY) * u);
       fingers.set(event.pointerId, event);
-      show();
     } else if (fingers.size === 2) {
       const before = spread();
       fingers.set(event.pointerId, event);
@@ -80,24 +107,45 @@ for (const map of document.querySelectorAll(".map")) {
     }
     tell(event);
   });
+  // A pointer that has hardly moved selects the mark below it.
+  const tap = event => {
+    if (!start || Math.hypot(event.clientX - start.clientX, event.clientY - start.clientY) > 6) return;
+    const mark = marked(event);
+    if (mark?.dataset.row !== undefined && list.pickNumber(mark.dataset.row)) return;
+    list.pick(null);
+    tell(event);
+    kept = out.textContent;
+  };
   for (const end of ["pointerup", "pointercancel"])
-    svg.addEventListener(end, event => { fingers.delete(event.pointerId); if (end === "pointerup") tell(event); });
-  svg.addEventListener("pointerleave", () => { if (!fingers.size) out.textContent = help; });
-  svg.addEventListener("wheel", event => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, place(event)); }, { passive: false });
-  map.querySelector(".tools").addEventListener("click", event => {
-    const what = event.target.dataset.do;
-    if (what === "in") zoom(1.5);
-    else if (what === "out") zoom(1 / 1.5);
-    else if (what === "all") { view = [...whole]; show(); }
-    else if (what === "focus") {
-      const [x, y, width] = data.focus, height = width * whole[3] / whole[2];
-      view = [x - width / 2, y - height / 2, width, height];
-      show();
-    }
+    sheet.addEventListener(end, event => { fingers.delete(event.pointerId); if (end === "pointerup") tap(event); });
+  sheet.addEventListener("pointerleave", () => { if (!fingers.size) out.textContent = kept; });
+  sheet.addEventListener("wheel", event => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, place(event)); }, { passive: false });
+  const all = () => { view = [...whole]; show(); };
+  const focus = () => {
+    const [x, y, width] = data.focus, height = width * whole[3] / whole[2];
+    view = [x - width / 2, y - height / 2, width, height];
+    show();
+  };
+  const actions = { in: () => zoom(1.5), out: () => zoom(1 / 1.5), all, focus };
+  map.querySelector(".tools").addEventListener("click", event => actions[event.target.dataset.do]?.());
+  sheet.addEventListener("keydown", event => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const step = 80 * unit();
+    const keys = {
+      ArrowLeft: () => pan(-step, 0), ArrowRight: () => pan(step, 0), ArrowUp: () => pan(0, -step), ArrowDown: () => pan(0, step),
+      "+": actions.in, "=": actions.in, "-": actions.out, 0: all, Home: all, Enter: () => list.pickNearest(centre()),
+    };
+    if (!keys[event.key]) return;
+    event.preventDefault();
+    keys[event.key]();
   });
   map.querySelector(".layers").addEventListener("change", event => {
-    svg.querySelector(`[data-layer="${event.target.value}"]`).style.display = event.target.checked ? "" : "none";
+    sheet.querySelector(`[data-layer="${CSS.escape(event.target.value)}"]`).style.display = event.target.checked ? "" : "none";
+    show();
   });
   addEventListener("resize", show);
   show();
-}
+  return { map, sheet, data, list, show, keep };
+};
+
+const openMaps = [...document.querySelectorAll(".map")].map(openMap);

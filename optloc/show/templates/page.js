@@ -1,4 +1,3 @@
-"use strict";
 // A click on a method in the legend highlights its lines in every figure.
 (() => {
   const picked = new Set();

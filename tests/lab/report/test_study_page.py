@@ -17,7 +17,7 @@ from optloc.lab.study.design import design_of
 from optloc.lab.study.execute import executor, run_design
 from optloc.lab.study.folder import begin, read_frame
 from optloc.show.drawing import marks as looks_of, panel, svg_text
-from optloc.show.map import Canvas, Curve, Label
+from optloc.show.maps.canvas import Canvas, Curve, Label, LegendEntry, MapRow
 from optloc.show.page import PagePart, write_page
 from optloc.show.sheet import Sheet, TextTable
 
@@ -133,8 +133,10 @@ def test_the_page_needs_nothing_and_is_not_fooled_by_names(made):
 
 def test_every_text_of_a_page_is_escaped():
     bad = "\"'><script>alert(1)</script>{{ 7 * 7 }}</pre>"
-    marks = [Curve("dot", "M0 0h0", tell=bad), Label("name", 0.0, 0.0, bad)]
-    canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad})
+    marks = [Curve("dot", "M0 0h0", hover=bad), Label("name", 0.0, 0.0, bad)]
+    rows = [MapRow(bad, bad, bad, "ok", bad, bad, bad, bad, 0.0, 0.0)]
+    more = {"rows": rows, "counted": bad, "stations": [(bad, bad)], "legend": [LegendEntry("ok", bad)], "summary": bad}
+    canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad}, listed=True, **more)
     sheet = Sheet(None, TextTable("t", bad, (bad,), ((bad,),), bad))
     part = PagePart("p", bad, bad, tables=[sheet], maps=[canvas], headings=True, folded=[sheet], source=bad, note=bad)
     page = write_page(bad, [part, part], opening=[bad], facts=bad, methods=looks_of([bad]).values())

@@ -10,7 +10,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.bounds.cramer_rao import crlb
 from optloc.bounds.over_area import bound_map, extent
 from optloc.files import from_table, read
-from optloc.show.map import land, rings
+from optloc.show.maps.background import land, rings
 from optloc.show.pictures.bound_map import isolines, levels, map_geojson, plot_bound_map
 
 DEMOS = package_files("optloc") / "scenarios"

@@ -61,7 +61,6 @@ def test_the_page_opens_without_complaint(tmp_path):
         ("m.png", ("--extent", "12,11,47,48"), DEMO, "not an extent of a map"),
         ("m.png", ("--extent", "11,12,47,95"), DEMO, "not an extent of a map"),
         ("m.png", ("--height", "low"), DEMO, "low"),
-        ("m.html", (), PLANE, "needs positions on Earth"),
         ("m.geojson", (), PLANE, "frame is cartesian"),
         ("m.html", ("--dilution",), DEMO, "can only be a picture"),
         ("no/m.png", (), DEMO, "cannot be written"),

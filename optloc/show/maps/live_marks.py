@@ -1,0 +1,56 @@
+"""Marks of a live map: the content of the feed from which the page draws the latest fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from optloc.base.frames import Frame
+from optloc.base.linalg import error_ellipse
+from optloc.base.types import Array
+from optloc.show.formats.marks import Mark, ellipse
+from optloc.show.maps.map_marks import map_row
+
+# Decimals of a degree, and of a metre, in the feed: a tenth of a millimetre.
+_DEGREES, _METRES = 9, 4
+
+
+def live_mark(frame: Frame, mark: Mark, trail: Sequence[Array] = ()) -> dict[str, Any]:
+    """Return a mark as JSON values for a live map.
+
+    Parameters
+    ----------
+    frame : Frame
+        Frame of the positions.
+    mark : Mark
+        The latest fix of a target.
+    trail : sequence of array (d,)
+        Positions of the same target, m, the oldest first.
+
+    Returns
+    -------
+    dict
+        `name`, `time`, `status`, `look`, `place`, `copied`, `size` and `note` as in `MapRow`. `at` is longitude and
+        latitude, degrees, or x and y, m. `trail` has the same for each position. `ellipse` has the semi-axes of the
+        95 % ellipse, m, and the bearing of the long axis, degrees; None without a valid covariance.
+    """
+    known = mark.covariance if mark.covers else np.full_like(mark.covariance, np.nan)
+    row = map_row(frame, mark.name, mark.time, mark.status, mark.reason, False, mark.position, known)
+    texts = {name: getattr(row, name) for name in ("name", "time", "status", "look", "place", "copied", "size", "note")}
+    axes = None
+    if mark.covers:
+        major, minor, bearing = ellipse(mark.level)
+        scale = float(error_ellipse(np.eye(2))[0][0])
+        axes = [scale * major, scale * minor, bearing]
+    places = [_place(frame, position) for position in trail]
+    return {**texts, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
+
+
+def _place(frame: Frame, position: Array) -> list[float]:
+    """Return longitude and latitude, degrees, of a position (d,), m; x and y, m, if the frame is not on Earth."""
+    if not frame.geodetic:
+        return [round(float(value), _METRES) for value in position[:2]]
+    lat, lon, _ = frame.to_geodetic(position)
+    return [round(float(np.degrees(value)), _DEGREES) for value in (lon, lat)]
