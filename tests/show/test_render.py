@@ -12,9 +12,9 @@ from show.ranging import ranged
 from optloc.base.types import Status
 from optloc.cli.output import Screen, show_answer
 from optloc.model_checks.geometry import Advice
+from optloc.show import fix_page
 from optloc.show.describe_fix import answer_of
 from optloc.show.fix_answer import SECTIONS
-from optloc.show.page import fix_page
 from optloc.show.render import dict_of_answer, html_of_answer, text_of_answer
 
 CASES = {**singles(), "batch": batch(), "two targets": states()}
@@ -51,7 +51,7 @@ RENDERINGS = {
     "text": lambda answer: flat(text_of_answer(answer)),
     "html": lambda answer: of_html(html_of_answer(answer)),
     "page": lambda answer: of_html(
-        re.sub("<script.*?</script>", "", fix_page(*ranged(), "page", (), answer), flags=re.DOTALL)
+        re.sub("<script.*?</script>", "", fix_page(*ranged(), "page", answer=answer), flags=re.DOTALL)
     ),
     "terminal": of_terminal,
     "dict": of_dict,
