@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import Status, solve
-from optloc.cli.app import app
+from optloc.cli.application import app
 from optloc.cli.options import shipped_problems
 from optloc.kernels.jit import plain
 

@@ -31,6 +31,6 @@ def test_what_loads_late_is_what_types_are_checked_by():
 
 def test_the_help_waits_for_no_schema():
     heavy = {"pydantic", "optloc.files.schema", "matplotlib", "pandas"}
-    code = f"import optloc.cli.app, sys; print(*sorted({heavy} & set(sys.modules)))"
+    code = f"import optloc.cli.application, sys; print(*sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc import InvalidProblem, NoSolution, Status, assemble, constraints, locate, measured, solve
-from optloc.cli.app import app
+from optloc.cli.application import app
 from optloc.problem import Prior
 from optloc.show import fix_page
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from optloc.base.faces import exported
 
 if TYPE_CHECKING:
-    from optloc.cli.app import app as app, main as main
+    from optloc.cli.application import app as app, main as main
     from optloc.cli.compile import TARGET as TARGET, problem_of as problem_of
     from optloc.cli.completion import complete as complete
     from optloc.cli.crlb import vector as vector

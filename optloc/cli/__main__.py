@@ -1,6 +1,6 @@
 """Entry point of ``python -m optloc.cli``."""
 
-from optloc.cli.app import main
+from optloc.cli.application import main
 
 if __name__ == "__main__":
     main()

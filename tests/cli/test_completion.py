@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.base.types import Status
-from optloc.cli.app import app
+from optloc.cli.application import app
 from optloc.cli.completion import choices, complete, stages, statuses
 from optloc.solvers import METHODS
 

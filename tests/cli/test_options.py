@@ -8,7 +8,7 @@ from typer.models import ArgumentInfo, OptionInfo
 from typer.testing import CliRunner
 
 from optloc import InvalidProblem, Status
-from optloc.cli.app import app
+from optloc.cli.application import app
 from optloc.cli.options import (
     allowed,
     constraints,

@@ -298,7 +298,7 @@ def test_what_is_wrong_is_one_short_sentence(name):
 def test_a_fix_prints_what_the_command_line_prints(tmp_path):
     from typer.testing import CliRunner
 
-    from optloc.cli.app import app
+    from optloc.cli.application import app
 
     path = bearing_file(tmp_path)
     told = " ".join(CliRunner().invoke(app, ["fix", str(path)], env={"COLUMNS": "200"}).stdout.split())

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.base.units import SPEED_OF_LIGHT as C
-from optloc.cli.app import app
+from optloc.cli.application import app
 from optloc.files.pseudoranges import read_log, received
 from optloc.files.rinex import WEEK, read_observations
 

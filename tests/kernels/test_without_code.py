@@ -97,7 +97,7 @@ def test_entries_are_kernels_that_there_are():
 
 ASKS = """
 import os, sys
-from optloc.cli.app import app
+from optloc.cli.application import app
 try:
     app(sys.argv[1:])
 except SystemExit:

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc.cli import app as application
-from optloc.cli.app import app, main
+from optloc.cli.application import app, main
 from optloc.files.schema import schema
 
 RUN = CliRunner()
@@ -34,6 +34,6 @@ def test_commands_end_with_their_code(words, code):
 def test_main_runs_the_application_as_a_process(monkeypatch):
     ended = []
     # The package has the application under the name of its module.
-    monkeypatch.setattr(sys.modules["optloc.cli.app"], "run_process", ended.append)
+    monkeypatch.setattr(sys.modules["optloc.cli.application"], "run_process", ended.append)
     main()
     assert ended == [app]
