@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from optloc.files.one_call import locate as locate
     from optloc.files.orbits import satellites as satellites
     from optloc.files.propagation import (
+        NOT_STATED as NOT_STATED,
         fits_sound as fits_sound,
         is_time as is_time,
         positive_speed as positive_speed,
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from optloc.files.table import Table as Table, of_rows as of_rows, table_of as table_of
     from optloc.files.unknowns import FREE as FREE, places_of as places_of, settle_frame as settle_frame
     from optloc.files.wave_speed import (
+        StatedSpeed as StatedSpeed,
         WaveOptions as WaveOptions,
         stated_speed as stated_speed,
         with_options as with_options,

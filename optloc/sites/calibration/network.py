@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.files import positive_speed, stated_speed
+from optloc.files import NOT_STATED, StatedSpeed, positive_speed, stated_speed
 from optloc.models import MODELS
 from optloc.problem import SPEED_OF_LIGHT, Amount, Array, HasShortForm, InvalidProblem, check_once
 
@@ -138,19 +138,22 @@ class Network(HasShortForm):
         )
 
 
-def network_speed(given: Amount | None, where: str) -> float:
-    """Return the wave speed of a network, m/s; light without a stated speed.
+def network_speed(given: Amount | None, where: str) -> StatedSpeed:
+    """Return the wave speed of a network; light without a stated speed.
 
     `given` is a number, or text as for `optloc.locate`, such as "air:20C". `where` is the place for messages. Raise
     InvalidProblem for an uncertain speed, or the file of a profile, which networks cannot use.
     """
+    if given is None:
+        return StatedSpeed(SPEED_OF_LIGHT, None, NOT_STATED)
     if not isinstance(given, str):
-        return SPEED_OF_LIGHT if given is None else positive_speed(given, "speed", where)
+        speed = positive_speed(given, "speed", where)
+        return StatedSpeed(speed, None, f"{speed:.6g} m/s")
     stated = stated_speed(given, where)
     if stated.sigma is not None:
         advice = "leave the standard deviation out; a wrong speed scales the network"
         raise InvalidProblem("the speed of a network is exact", where, advice)
-    return stated.speed
+    return stated
 
 
 def checked(made: Network) -> Network:

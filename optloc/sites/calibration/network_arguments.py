@@ -84,7 +84,7 @@ def network_of(
         For values that contradict the known distances between stations, such as centimetres read as metres.
     """
     kind = kind_named(kind)
-    metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed")
+    metres = 1.0 if wave_speed is None else network_speed(wave_speed, "wave_speed").speed
     if two_way or turn_around is not None:
         metres, z = 0.5 * metres, np.asarray(z, dtype=float) - _pause(kind, wave_speed, turn_around)
     z, sigma = metres * np.asarray(z, dtype=float), metres * np.asarray(sigma, dtype=float)

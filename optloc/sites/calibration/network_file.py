@@ -7,7 +7,7 @@ coordinates.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -102,13 +102,26 @@ def read_network(
     path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
 ) -> Network:
     """Return the network of a file; see `load_network`."""
-    return load_network(path, wave_speed, two_way=two_way, turn_around=turn_around)[0]
+    return load_network(path, wave_speed, two_way=two_way, turn_around=turn_around).network
+
+
+class LoadedNetwork(NamedTuple):
+    """A network that was read from a file.
+
+    - network: the network.
+    - warnings: sentences about values that are physically suspicious.
+    - wave: the wave speed with which times were converted, as text; empty if no value is a time.
+    """
+
+    network: Network
+    warnings: tuple[str, ...]
+    wave: str
 
 
 def load_network(
     path: Path, wave_speed: str | None = None, *, two_way: bool = False, turn_around: str | None = None
-) -> tuple[Network, tuple[str, ...]]:
-    """Return the network of a file, and sentences about values that are physically suspicious.
+) -> LoadedNetwork:
+    """Return the network of a file, sentences about suspicious values, and the wave speed.
 
     Parameters
     ----------
@@ -134,7 +147,8 @@ def load_network(
         raise InvalidProblem(what, source, "use optloc fix, or see optloc new calibration")
     file = validated(NetworkFile, data, source)
     given, where = file.propagation_speed, join(source, "key 'propagation_speed'")
-    speed = network_speed(*((given, where) if wave_speed is None else (wave_speed, "--wave-speed")))
+    stated = network_speed(*((given, where) if wave_speed is None else (wave_speed, "--wave-speed")))
+    speed = stated.speed
     table = with_standard_columns(
         table_of(file.stations, folder, where := join(source, "[stations]")), file.stations.unit
     )
@@ -168,13 +182,10 @@ def load_network(
         )
     )
     factors = {one.kind: Units("length", speed).conversion(one.unit, source).factor for one in file.measurements}
-    if (
-        given is None
-        and wave_speed is None
-        and any(is_time(Units("length"), s.unit, source) for s in file.measurements)
-    ):
+    timed = any(is_time(Units("length"), section.unit, source) for section in file.measurements)
+    if timed and given is None and wave_speed is None:
         require_speed(network, source, '--wave-speed air:20C or propagation_speed = "air:20C"')
-    return network, suspicious_network(network, factors, speed)
+    return LoadedNetwork(network, suspicious_network(network, factors, speed), stated.words if timed else "")
 
 
 _Rows = tuple[str, Array, Array, Array, Array, Array]

@@ -82,8 +82,10 @@ def _run(
     claim_outputs(out, picture=plot, inputs=[file])
     if out is not None:
         check_name(out)
-    network, warnings = load_network(file, wave[0], two_way=wave[1], turn_around=wave[2])
+    network, warnings, speed = load_network(file, wave[0], two_way=wave[1], turn_around=wave[2])
     if not quiet and not as_json:
+        if speed:
+            say(Screen(), f"Wave speed: {speed}.")
         for sentence in warnings:
             say(Screen(), f"Warning: {sentence}.")
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
@@ -95,7 +97,7 @@ def _run(
     if plot is not None:
         write_picture(_picture(found, file.stem), plot)
     if as_json:
-        write_text(Path("-"), dumps(_record(found, file) | {"warnings": warnings}))
+        write_text(Path("-"), dumps(_record(found, file) | {"warnings": warnings, "wave_speed": speed or None}))
     elif not quiet:
         _show(found)
         if out is not None:

@@ -154,6 +154,9 @@ def test_the_wave_speed_of_a_network_is_an_option(folder):
     by_key = read_network(folder / "hall.toml")
     assert by_option.z == pytest.approx(by_key.z)
     assert by_option.sigma.min() == pytest.approx(0.0343215, rel=1e-4)
+    done = run("calibrate", folder / "hall.toml")
+    assert "Wave speed: 343.2" in done.output
+    assert json.loads(run("calibrate", folder / "hall.toml", "--json").stdout)["wave_speed"].startswith("343.2")
     for speed, words in (("343+-5 m/s", "the speed of a network is exact"), ("warm", "no wave speed")):
         done = run("calibrate", folder / "hall.toml", "--wave-speed", speed)
         assert done.exit_code == 2
