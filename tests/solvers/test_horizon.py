@@ -9,7 +9,7 @@ from optloc.base.types import Status
 from optloc.files.convert import interpret_table
 from optloc.files.table_import import ColumnHints
 from optloc.solvers.certificates.branch_and_bound import BARRED, LOST
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden
 
 UP = np.array([[1.0, 0.2, 0.1], [0.9, -0.3, 0.3], [0.8, 0.5, -0.3], [0.7, -0.4, -0.5], [0.6, 0.1, 0.8]])
 SATELLITES = 26.6e6 * UP / np.linalg.norm(UP, axis=1)[:, None]
