@@ -21,8 +21,6 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import (
     TOLERANCE,
     Face,
-    Level,
-    band_at,
     bound_of,
     exact,
     faces,
@@ -36,6 +34,7 @@ from optloc.problem.chart import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.around import starts_around
+from optloc.solvers.face_starts import limited_to, spread_along, structure
 from optloc.solvers.horizon import first_sentence, is_hidden, name_hidden
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_MISFIT
@@ -112,17 +111,8 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     # a feasible cheapest candidate is the answer, and without inequalities there is no other face
     if not len(unanswered) or sides == [exact(problem)]:
         return kept
-    starts, strata = _cheapest(pool, unanswered), strata_of(problem)
-    starts = starts if strata is None else in_every_layer(strata, starts)
-    # face 0 has no inequality, and its minima are in the pool already
-    on_faces = _on_faces(problem, sides, unanswered, starts, descend)
-    size, width = len(pool.x), sum(found[1].shape[1] for found in on_faces)
-    x = np.full((size, width, pool.x.shape[-1]), np.nan)
-    cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
-    face = np.zeros((size, width), dtype=int)
-    refused_on_faces = np.full((size, width), np.inf)
-    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (refused_on_faces, 4)):
-        array[unanswered] = np.concatenate([found[place] for found in on_faces], axis=1)
+    found = _search(problem, pool, kept, sides, unanswered, descend)
+    x, cost, code, face, refused_on_faces = _in_rows(found, unanswered, len(pool.x))
     refused_on_faces = np.where(_fits(pool, refused_on_faces), refused_on_faces, np.inf)
     # the slope of the cost inwards is computed for least squares, so a robust loss is not tested
     if not pool.loss:
@@ -137,6 +127,63 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
         code=np.concatenate([kept.code, code], axis=1),
         face=np.concatenate([kept.face, face], axis=1),
     )
+
+
+Found = tuple[Array, Array, Array, Array, Array]
+"""Minima on faces: x (n, q, size), and cost, code, face and cost if infeasible (n, q); infinite costs if none."""
+
+# Rise of chi-square above the cheapest candidate from which minima are searched all along the faces: the constraints
+# move the fix by two standard deviations. Below that the least minimum is next to the candidate.
+_RISE = 4.0
+# Minima of the wider search that are kept for each problem, the cheapest.
+_KEPT = 12
+
+
+def _search(problem: Problem, pool: Pool, kept: Pool, sides: list[Face], items: Array, descend: Descend) -> Found:
+    """Return the minima on all faces of the problems `items` (n,), whose cheapest candidate is not admitted.
+
+    `pool` and `kept` are the candidates with and without those that are not admitted, and `sides` are all faces. If the
+    faces cost much more than the cheapest candidate, they are searched along their whole length.
+    """
+    starts, strata = _cheapest(pool, items, _STARTS), strata_of(problem)
+    starts = starts if strata is None else in_every_layer(strata, starts)
+    # face 0 has no inequality, and its minima are in the pool already
+    around = [starts_around(problem, side, items, starts[:, 0]) for side in sides[1:]]
+    wider = [np.concatenate([starts, one], axis=1) for one in around]
+    found = _on_faces(problem, sides, items, wider, descend)
+    inside = np.where(kept.code == Status.OK, kept.cost, np.inf)[items].min(1)
+    least = np.minimum(found[1].min(1, initial=np.inf), inside)
+    finished = np.where((pool.code == Status.OK) & np.isfinite(pool.cost), pool.cost, np.inf)[items].min(1)
+    with np.errstate(invalid="ignore"):
+        rise = np.where(np.isfinite(least), least - finished, np.inf)
+    again = np.flatnonzero((rise > _RISE) & np.isfinite(finished))
+    if not len(again):
+        return found
+    part, candidates = problem.take(items[again]), _cheapest(pool, items[again], pool.x.shape[1])
+    spread = spread_along(part, sides, candidates, rise[again])
+    more = _cheapest_found(_on_faces(problem, sides, items[again], spread, descend), _KEPT)
+    more = _in_rows(more, again, len(items))
+    x, cost, code, face, refused = (np.concatenate(both, axis=1) for both in zip(found, more, strict=True))
+    return x, cost, code, face, refused
+
+
+def _cheapest_found(found: Found, count: int) -> Found:
+    """Return the `count` cheapest minima of each problem."""
+    x, cost, code, face, refused = found
+    order = np.argsort(cost, axis=1, kind="stable")[:, :count]
+    x = np.take_along_axis(x, order[..., None], axis=1)
+    cost, code, face, refused = (np.take_along_axis(one, order, axis=1) for one in (cost, code, face, refused))
+    return x, cost, code, face, refused
+
+
+def _in_rows(found: Found, items: Array, size: int) -> Found:
+    """Return the minima of the problems `items` (n,) as those of all `size` problems; the others have none."""
+    count = found[1].shape[1]
+    x = np.full((size, count, found[0].shape[-1]), np.nan)
+    cost, refused = (np.full((size, count), np.inf) for _ in range(2))
+    code, face = np.full((size, count), int(Status.INFEASIBLE), dtype=np.int8), np.zeros((size, count), dtype=int)
+    x[items], cost[items], code[items], face[items], refused[items] = found
+    return x, cost, code, face, refused
 
 
 def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> Pool:
@@ -185,9 +232,9 @@ def _mark_infeasible(pool: Pool, broken: Array) -> Pool:
     return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 
 
-def _cheapest(pool: Pool, items: Array) -> Array:
-    """Return the cheapest candidates (n, q, size) of problems `items` (n,), q at most `_STARTS`; NaN in empty slots."""
-    order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
+def _cheapest(pool: Pool, items: Array, count: int) -> Array:
+    """Return the cheapest candidates (n, q, size) of problems `items` (n,), q at most `count`; NaN in empty slots."""
+    order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :count]
     x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
     good = np.isfinite(np.take_along_axis(pool.cost[items], order, axis=1))
     return np.where(good[..., None], x, np.nan)
@@ -197,91 +244,67 @@ def _cheapest(pool: Pool, items: Array) -> Array:
 _TOGETHER = 2**14
 
 
-def _on_faces(
-    problem: Problem, sides: list[Face], items: Array, starts: Array, descend: Descend
-) -> list[tuple[Array, ...]]:
-    """Return, for each face but the first, what `_on_alike` returns for it.
+def _on_faces(problem: Problem, sides: list[Face], items: Array, starts: list[Array], descend: Descend) -> Found:
+    """Return the minima on each face but the first, one face after the other.
 
-    `sides` is the list of all faces. `items` (n,) are the numbers of the problems, and `starts` (n, q, size) their
-    starts. Faces with the same quantities are one batch: a road has many of them.
+    `sides` is the list of all faces. `items` (n,) are the numbers of the problems, and `starts` has the starts (n, q,
+    size) on each face but the first. Faces with the same quantities are one batch: a road has many of them.
     """
-    found: dict[int, tuple[Array, ...]] = {}
+    found: dict[int, Found] = {}
     groups: dict[tuple[Hashable, ...], list[int]] = {}
     for number in range(1, len(sides)):
-        groups.setdefault(_structure(problem, sides[number]), []).append(number)
-    most = max(1, _TOGETHER // max(1, 4 * starts.shape[0] * starts.shape[1]))
+        groups.setdefault(structure(problem, sides[number]), []).append(number)
+    most = max(1, _TOGETHER // max(1, len(items) * max((one.shape[1] for one in starts), default=1)))
     for numbers in groups.values():
         for first in range(0, len(numbers), most):
             chosen = numbers[first : first + most]
-            found |= dict(zip(chosen, _on_alike(problem, sides, chosen, items, starts, descend), strict=True))
-    return [found[number] for number in range(1, len(sides))]
-
-
-def _structure(problem: Problem, face: Face) -> tuple[Hashable, ...]:
-    """Return a key of everything but the numbers of the levels of a face."""
-    bands = [(band_at(problem, level), level.epoch) for level in face]
-    return tuple((b.kind, b.target, b.other, b.table, b.coefficients.shape[-1], epoch) for b, epoch in bands)
+            own = [starts[number - 1] for number in chosen]
+            found |= dict(zip(chosen, _on_alike(problem, sides, chosen, items, own, descend), strict=True))
+    ordered = [found[number] for number in range(1, len(sides))]
+    x, cost, code, face, refused = (np.concatenate(parts, axis=1) for parts in zip(*ordered, strict=True))
+    return x, cost, code, face, refused
 
 
 def _on_alike(
-    problem: Problem, sides: list[Face], numbers: list[int], items: Array, starts: Array, descend: Descend
-) -> list[tuple[Array, ...]]:
-    """Return x, cost, code and face (n, q) of the minima on faces, and the costs (n, q) of infeasible minima.
+    problem: Problem, sides: list[Face], numbers: list[int], items: Array, starts: list[Array], descend: Descend
+) -> list[Found]:
+    """Return the minima on faces with the same quantities, one entry for each face.
 
-    `numbers` are the indices in `sides` of faces with the same quantities; the result has one entry for each. `items`
-    and `starts` are as for `_on_faces`; curved faces get more starts. Costs are infinite in all other slots.
+    `numbers` are the indices of these faces in `sides`, and `starts` has the starts (n, q, size) on each of them.
+    `items` are as for `_on_faces`. Costs are infinite in slots without a minimum.
     """
-    wider = [
-        np.concatenate([starts, starts_around(problem, sides[number], items, starts[:, 0])], axis=1)
-        for number in numbers
-    ]
-    places = [np.nonzero(np.isfinite(one).all(-1)) for one in wider]
+    places = [np.nonzero(np.isfinite(one).all(-1)) for one in starts]
     own = np.concatenate([items[row] for row, _ in places])
-    start = np.concatenate([one[place] for one, place in zip(wider, places, strict=True)])
-    part, counts = problem.take(own), [len(row) for row, _ in places]
-    bands, size = [], problem.batch_shape[0]
-    for k in range(len(sides[numbers[0]])):
-        same = [(band_at(problem, sides[n][k]), bound_of(problem, sides[n][k])) for n in numbers]
-        splits = np.split(own, np.cumsum(counts)[:-1])
-        value = np.concatenate([np.broadcast_to(b, (size,))[one] for (_, b), one in zip(same, splits, strict=True)])
-        c = np.concatenate(
-            [
-                np.broadcast_to(band.coefficients, (size, band.coefficients.shape[-1]))[one]
-                for (band, _), one in zip(same, splits, strict=True)
-            ]
-        )
-        bands.append(replace(same[0][0], lower=value, upper=value, coefficients=c))
-    face = tuple(Level(k, "equal", level.epoch) for k, level in enumerate(sides[numbers[0]]))
-    limited = replace(part, constraints=tuple(bands))
+    start = np.concatenate([one[place] for one, place in zip(starts, places, strict=True)])
+    if not len(own):
+        empty = np.zeros(0)
+        return [
+            _filled(n, one, place, start, empty, empty, empty)
+            for n, one, place in zip(numbers, starts, places, strict=True)
+        ]
+    part = problem.take(own)
+    limited, face = limited_to(problem, [sides[n] for n in numbers], own, [len(row) for row, _ in places])
     ends, cost, status = descend(limited, start, np.arange(len(own)), face)
     # bent levels need not meet, and a point on one of them only is no minimum on both
     missed = np.abs(levels(limited, face, ends)[0])
-    on_levels = (missed <= TOLERANCE * (1.0 + np.abs(np.stack([b.lower for b in bands], axis=1)))).all(1)
+    value = np.stack([bound_of(limited, level) for level in face], axis=1)
+    on_levels = (missed <= TOLERANCE * (1.0 + np.abs(value))).all(1)
     # a minimum on a face may break another constraint; the face of both constraints is tried too
     inside = on_levels & (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
     code = np.where(inside, status, np.int8(Status.INFEASIBLE))
     refused = np.where(inside | (status != Status.OK), np.inf, cost)
     out, first = [], 0
-    for number, one, place in zip(numbers, wider, places, strict=True):
+    for number, one, place in zip(numbers, starts, places, strict=True):
         end = first + len(place[0])
-        out.append(
-            _filled(
-                number,
-                one,
-                place,
-                ends[first:end],
-                np.where(inside, cost, np.inf)[first:end],
-                code[first:end],
-                refused[first:end],
-            )
-        )
+        least = np.where(inside, cost, np.inf)[first:end]
+        out.append(_filled(number, one, place, ends[first:end], least, code[first:end], refused[first:end]))
         first = end
     return out
 
 
 def _filled(
     number: int, starts: Array, place: tuple[Array, ...], x: Array, cost: Array, code: Array, refused: Array
-) -> tuple[Array, ...]:
+) -> Found:
     """Return the results of one face in the slots `place` of its `starts` (n, q, size); see `_on_alike`."""
     shape = starts.shape[:2]
     costs, codes = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
