@@ -18,11 +18,12 @@ import numpy as np
 from optloc.base.linalg import centre_and_spread, spread_directions
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
-from optloc.linear.constraints import TOLERANCE, Face, Level, band_at, binds_position, bound_of, levels, violation
+from optloc.linear.constraints import TOLERANCE, Face, Level, band_at, binds_position, bound_of, violation
 from optloc.linear.normal import marginal
 from optloc.linear.vectors import complete
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.retraction import is_on, projected
 
 # Points around the best candidate: in random directions, at these multiples of the distance at which the cost without
 # constraints has risen to the cost on the face. In the quadratic model all points of less cost are within a multiple
@@ -40,8 +41,6 @@ _WEAKEST = 1e-8
 # Candidates that are projected; local minima kept on one face, of all points and of the points that meet every other
 # constraint; and starts kept on all faces of one problem. A fix with several hundred faces takes a second.
 _PROJECTED, _KEPT, _ADMITTED, _IN_ALL = 8, 4, 3, 96
-# Newton steps of a projection. Descents return to the face anyway.
-_STEPS = 6
 # Neighbours with which a point is compared, for each dimension of a face, and at most.
 _NEIGHBOURS, _MOST_NEIGHBOURS = 3, 8
 # Most numbers of a working array: some tens of megabytes.
@@ -225,12 +224,10 @@ def _lowest_on(
     x = np.tile(points.reshape(-1, size), (f, 1))
     good = np.isfinite(x).all(-1)
     x = np.where(good[:, None], x, 0.0)
-    x[:, :s] = _projected(limited, face, x, roots[own, second])
+    x[:, :s] = projected(limited, face, x, roots[own, second])
     with np.errstate(all="ignore"):
         x = complete(limited, x[:, None, :s])[:, 0]
-        missed = np.abs(levels(limited, face, x)[0])
-        bound = np.abs(np.stack([np.broadcast_to(b.lower, (len(x),)) for b in limited.constraints], axis=1))
-        good &= (missed <= TOLERANCE * (1.0 + bound)).all(1) & np.isfinite(x).all(-1)
+        good &= is_on(limited, face, x) & np.isfinite(x).all(-1)
         x = np.where(good[:, None], x, 0.0)
         cost = equations_at(limited, x).cost
         admitted = violation(problem.take(own), x) <= TOLERANCE
@@ -248,24 +245,6 @@ def _lowest_on(
     best = np.argsort(cost, axis=1, kind="stable")[:, :width]
     least = np.take_along_axis(cost, best, axis=1)
     return np.take_along_axis(x, best[..., None], axis=1).reshape(f, n, -1, size), least.reshape(f, n, -1)
-
-
-def _projected(problem: Problem, face: Face, x: Array, root: Array) -> Array:
-    """Return the shared unknowns (M, s) of vectors projected onto a face along the shortest way in a metric.
-
-    Newton steps; `root` (M, s, s) times its transpose is the inverse of the metric.
-    """
-    s = problem.layout.n_shared
-    x = x.copy()
-    for _ in range(_STEPS):
-        with np.errstate(all="ignore"):
-            values, gradients = levels(problem, face, x)
-            across = gradients @ root
-            # a point without a gradient stays, and is then not on the face
-            across, values = (np.where(np.isfinite(part), part, 0.0) for part in (across, values))
-            step = root @ (np.linalg.pinv(across) @ values[..., None])
-        x[:, :s] -= step[..., 0]
-    return x[:, :s]
 
 
 def _neighbours(points: Array, present: Array, count: int) -> Array:

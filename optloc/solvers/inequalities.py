@@ -21,7 +21,6 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import (
     TOLERANCE,
     Face,
-    bound_of,
     exact,
     faces,
     is_held,
@@ -39,6 +38,7 @@ from optloc.solvers.horizon import first_sentence, is_hidden, name_hidden
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_MISFIT
 from optloc.solvers.pool import Pool
+from optloc.solvers.retraction import descend_along, is_on
 
 Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
 """Maps problems, starts (M, size), the problem of each start (M,) and a face to points, costs and statuses there."""
@@ -58,11 +58,30 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
     `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
     """
     strata = strata_of(problem, face)
-    if strata is None:
-        done = refine(problem, start, item=item, face=face, limit=_STEPS)
-    else:
+    if strata is not None:
         done = refine_in_layers(problem, strata, start, item, face, _STEPS)
-    return done.x, done.cost, done.status
+        return done.x, done.cost, done.status
+    done = refine(problem, start, item=item, face=face, limit=_STEPS)
+    x, cost, status = done.x, done.cost, done.status
+    # other unknowns of single epochs than emission times would have to be fitted after each projection
+    simple = problem.layout.size == problem.layout.n_shared or bool(problem.emitting)
+    left = np.flatnonzero((status != Status.OK) & ~is_on(problem.take(item), face, x)) if simple and face else []
+    if not len(left):
+        return x, cost, status
+    again, least, code = descend_along(problem.take(item[left]), face, start[left])
+    held = code != Status.NUMERICAL
+    if not held.any():
+        return x, cost, status
+    left, again, least, code = left[held], again[held], least[held], code[held]
+    # the last digits, unless the refinement leaves the face again
+    part = problem.take(item[left])
+    last = refine(part, again, face=face, limit=_STEPS)
+    better = (last.status == Status.OK) & is_on(part, face, last.x) & (last.cost <= least)
+    x, cost, status = x.copy(), cost.copy(), status.copy()
+    x[left] = np.where(better[:, None], last.x, again)
+    cost[left] = np.where(better, last.cost, least)
+    status[left] = np.where(better, np.int8(Status.OK), code)
+    return x, cost, status
 
 
 def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares) -> Pool:
@@ -286,9 +305,7 @@ def _on_alike(
     limited, face = limited_to(problem, [sides[n] for n in numbers], own, [len(row) for row, _ in places])
     ends, cost, status = descend(limited, start, np.arange(len(own)), face)
     # bent levels need not meet, and a point on one of them only is no minimum on both
-    missed = np.abs(levels(limited, face, ends)[0])
-    value = np.stack([bound_of(limited, level) for level in face], axis=1)
-    on_levels = (missed <= TOLERANCE * (1.0 + np.abs(value))).all(1)
+    on_levels = is_on(limited, face, ends)
     # a minimum on a face may break another constraint; the face of both constraints is tried too
     inside = on_levels & (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
     code = np.where(inside, status, np.int8(Status.INFEASIBLE))
