@@ -1,4 +1,4 @@
-"""Bounds and the horizon: what the Earth hides, and minima on the faces of a box, against SciPy."""
+"""Bounds: minima on faces, against SciPy and against the cost along a whole face."""
 
 from dataclasses import replace
 
@@ -7,37 +7,11 @@ import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 from scipy.optimize import minimize
 
-from optloc import Status, assemble, constraints, measured
-from optloc.base.frames import ECEF
+from optloc import Status, assemble, constraints, measured, solve
 from optloc.linear.constraints import faces
-from optloc.solvers.inequalities import bound_pool, is_hidden, is_minimum, lowest_sight, without_broken
+from optloc.solvers.inequalities import bound_pool, is_minimum, without_broken
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
-
-RADIUS, HIGH = 6378137.0, 26.6e6
-# satellites over the equator at these longitudes, degrees
-SATELLITES = np.radians([0.0, 60.0, 100.0])
-
-
-def from_space():
-    stations = HIGH * np.stack([np.cos(SATELLITES), np.sin(SATELLITES), 0.0 * SATELLITES], axis=-1)
-    return assemble(stations, measured("range", np.full(3, 2.3e7), a=np.arange(3), sigma=5.0), frame=ECEF).flat()
-
-
-def test_a_satellite_below_the_horizon_is_hidden():
-    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
-    # from longitude 0 the satellite at 100 degrees is below the horizon, which is 76 degrees away
-    assert is_hidden(problem, ground).tolist() == [True]
-    assert is_hidden(problem.with_rows(weight=np.array([[1.0, 1.0, 0.0]])), ground).tolist() == [False]
-    assert not is_hidden(ranges_to(PLACE, 1.0), PLACE[None]).any()
-
-
-def test_the_lowest_sight_is_the_sine_of_the_elevation():
-    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
-    line = HIGH * np.stack([np.cos(SATELLITES), np.sin(SATELLITES)], axis=-1) - [RADIUS, 0.0]
-    expected = (line[:, 0] / np.linalg.norm(line, axis=1)).min()
-    assert lowest_sight(problem, ground)[0] == pytest.approx(expected, abs=1e-9)
-    assert lowest_sight(ranges_to(PLACE, 1.0), PLACE[None]).tolist() == [0.0]
 
 
 @pytest.fixture
@@ -69,3 +43,42 @@ def test_candidates_beyond_a_bound_are_refused(held):
     assert pool.code[0, 0] == Status.INFEASIBLE
     wide = replace(problem, constraints=tuple(constraints.box([0.0, 0.0], [1e3, 1e3])))
     assert bound_pool(wide, free) is free
+
+
+# Stations, measured ranges, normal and limits of a band: data that contradict it by hundreds of chi-square.
+STATIONS = np.array([[-27.0, 3.0], [282.0, -11.0], [-508.0, -101.0]])
+NORMAL = np.array([0.97, -0.245]) / np.hypot(0.97, -0.245)
+
+
+def far_from(band, z):
+    rows = measured("range", z, a=np.arange(3), sigma=20.0)
+    return assemble(STATIONS, rows, constraints=constraints.band(NORMAL, *band))
+
+
+def least_along(band, z):
+    """Return the least cost on the two edges of a band, at points a tenth of a metre apart."""
+    along = np.arange(-2e3, 2e3, 0.1)[:, None] * [-NORMAL[1], NORMAL[0]]
+    places = np.concatenate([side * NORMAL + along for side in band])
+    away = np.linalg.norm(places[:, None] - STATIONS, axis=-1)
+    return (((away - z) / 20.0) ** 2).sum(-1).min()
+
+
+def test_no_minimum_is_missed_along_an_edge_far_from_the_data():
+    random = np.random.default_rng(3)
+    missed = []
+    for number in range(12):
+        z = np.linalg.norm(random.uniform(-250.0, 250.0, 2) + 200.0 * NORMAL - STATIONS, axis=1)
+        band = np.array([-115.5, -62.8]) - 20.0 * number
+        fix = solve(far_from(band, z))
+        if fix.cost > least_along(band, z) + 1e-2:
+            missed.append(number)
+    assert not missed
+
+
+def test_the_problems_of_a_batch_are_searched_one_by_one():
+    z = np.array([[250.0, 380.0, 420.0], [300.0, 250.0, 500.0], [100.0, 250.0, 490.0]])
+    together = solve(far_from((-200.0, -190.0), z))
+    for i, one in enumerate(z):
+        alone = solve(far_from((-200.0, -190.0), one))
+        np.testing.assert_allclose(together.position[i], alone.position, atol=1e-6)
+        assert together.code[i] == alone.code
