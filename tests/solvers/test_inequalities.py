@@ -45,40 +45,59 @@ def test_candidates_beyond_a_bound_are_refused(held):
     assert bound_pool(wide, free) is free
 
 
-# Stations, measured ranges, normal and limits of a band: data that contradict it by hundreds of chi-square.
-STATIONS = np.array([[-27.0, 3.0], [282.0, -11.0], [-508.0, -101.0]])
-NORMAL = np.array([0.97, -0.245]) / np.hypot(0.97, -0.245)
+# Data that contradict a half-plane or a band by hundreds of chi-square: kind, stations, measurements, standard
+# deviation, direction of the normal in degrees, and limits. Descents from the candidates without limits missed the least
+# minimum.
+FAR = {
+    "four differences": (
+        "tdoa",
+        [[-439, -144], [-45, -367], [40, 6], [498, -144], [-284, -6]],
+        ([-305, -401, -160, -94], 60.0, 4.5, (-161.0, -136.0)),
+    ),
+    "six ranges": (
+        "range",
+        [[-268, -90], [-178, -197], [8, -409], [142, -410], [-441, -155], [570, -473]],
+        ([285, 318, 503, 482, 468, 796], 20.0, -34.3, (171.0, 251.0)),
+    ),
+    "five differences": (
+        "tdoa",
+        [[541, -501], [-101, -550], [-108, -271], [-97, 59], [509, -90], [14, -539]],
+        ([-7, -155, -185, -254, -24], 20.0, 171.0, (-62.0, 38.0)),
+    ),
+    "half-plane": (
+        "tdoa",
+        [[482, -572], [224, 221], [-411, -538], [-584, 79], [402, -326], [-116, 479]],
+        ([-670, -7, -180, -235, -451], 20.0, 156.7, (-np.inf, -140.0)),
+    ),
+}
 
 
-def far_from(band, z):
-    rows = measured("range", z, a=np.arange(3), sigma=20.0)
-    return assemble(STATIONS, rows, constraints=constraints.band(NORMAL, *band))
-
-
-def least_along(band, z):
-    """Return the least cost on the two edges of a band, at points a tenth of a metre apart."""
-    along = np.arange(-2e3, 2e3, 0.1)[:, None] * [-NORMAL[1], NORMAL[0]]
-    places = np.concatenate([side * NORMAL + along for side in band])
-    away = np.linalg.norm(places[:, None] - STATIONS, axis=-1)
-    return (((away - z) / 20.0) ** 2).sum(-1).min()
-
-
-def test_no_minimum_is_missed_along_an_edge_far_from_the_data():
-    random = np.random.default_rng(3)
-    missed = []
-    for number in range(12):
-        z = np.linalg.norm(random.uniform(-250.0, 250.0, 2) + 200.0 * NORMAL - STATIONS, axis=1)
-        band = np.array([-115.5, -62.8]) - 20.0 * number
-        fix = solve(far_from(band, z))
-        if fix.cost > least_along(band, z) + 1e-2:
-            missed.append(number)
-    assert not missed
+@pytest.mark.parametrize("case", FAR)
+def test_no_minimum_is_missed_along_an_edge_far_from_the_data(case):
+    kind, places, (z, sigma, heading, limits) = FAR[case]
+    stations, first = np.array(places, dtype=float), 0 if kind == "range" else 1
+    others = {} if kind == "range" else {"b": 0}
+    rows = measured(kind, np.array(z, dtype=float), a=np.arange(first, len(stations)), sigma=sigma, **others)
+    normal = np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading))])
+    fix = solve(assemble(stations, rows, constraints=constraints.band(normal, *limits)))
+    # the cost at points half a metre apart along both edges
+    along = np.arange(-3e3, 3e3, 0.5)[:, None] * [-normal[1], normal[0]]
+    edge = np.concatenate([limit * normal + along for limit in limits if np.isfinite(limit)])
+    away = np.linalg.norm(edge[:, None] - stations, axis=-1)
+    modelled = away if kind == "range" else away[:, 1:] - away[:, :1]
+    assert fix.cost <= (((modelled - z) / sigma) ** 2).sum(-1).min()
 
 
 def test_the_problems_of_a_batch_are_searched_one_by_one():
     z = np.array([[250.0, 380.0, 420.0], [300.0, 250.0, 500.0], [100.0, 250.0, 490.0]])
-    together = solve(far_from((-200.0, -190.0), z))
+    stations = np.array([[-27.0, 3.0], [282.0, -11.0], [-508.0, -101.0]])
+
+    def solved(ranges):
+        rows = measured("range", ranges, a=np.arange(3), sigma=20.0)
+        return solve(assemble(stations, rows, constraints=constraints.band([0.97, -0.245], -200.0, -190.0)))
+
+    together = solved(z)
     for i, one in enumerate(z):
-        alone = solve(far_from((-200.0, -190.0), one))
+        alone = solved(one)
         np.testing.assert_allclose(together.position[i], alone.position, atol=1e-6)
         assert together.code[i] == alone.code
