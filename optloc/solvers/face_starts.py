@@ -4,8 +4,8 @@ Candidates of the problem without constraints are far from such a face, and desc
 around the candidates and around the stations are projected onto the face. Those that cost less than their neighbours
 are starts.
 
-Letters: n problems, q candidates or starts of each, k points of each, M points of several problems, c levels of a
-face, `size` numbers of a parameter vector, the first s of which all epochs share.
+Letters: n problems, q candidates or starts of each, k points of each, M points of several problems. A face has c levels.
+A parameter vector has `size` numbers, the first s of which all epochs share.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.retraction import is_on, projected
 
-# Points around the best candidate: in random directions, at these multiples of the distance at which the cost without
-# constraints has risen to the cost on the face. In the quadratic model all points of less cost are within a multiple
-# of one; the cost of ranges is not quadratic, so that two is tried too.
+# Points around the best candidate: random directions, and multiples of a distance. At this distance the cost without
+# constraints has risen to the cost on the face. If the cost is quadratic, the minimum is within a multiple of one. The
+# cost of ranges is not quadratic, so that two is tried too.
 _DIRECTIONS, _MULTIPLES = 54, (0.5, 1.0, 2.0)
 # Points around the middle of the stations: directions by dimension, and multiples of the spread of the stations.
 # Targets are seldom farther than that, and minima that are farther belong to candidates, which are projected too.
@@ -38,8 +38,8 @@ _LEAST_RISE = 9.0
 _FARTHEST = 10.0
 # Least eigenvalue of the information, scaled to a unit diagonal, that is not rounding error: half the digits.
 _WEAKEST = 1e-8
-# Candidates that are projected; local minima kept on one face, of all points and of the points that meet every other
-# constraint; and starts kept on all faces of one problem. A fix with several hundred faces takes a second.
+# Candidates that are projected. Local minima kept on one face: of all points, and of the admitted ones. Starts kept on
+# all faces of one problem: a fix with several hundred faces takes a second.
 _PROJECTED, _KEPT, _ADMITTED, _IN_ALL = 8, 4, 3, 96
 # Neighbours with which a point is compared, for each dimension of a face, and at most.
 _NEIGHBOURS, _MOST_NEIGHBOURS = 3, 8
@@ -250,7 +250,7 @@ def _lowest_on(
 def _neighbours(points: Array, present: Array, count: int) -> Array:
     """Return the indices (N, k, k or N, k, count) of the nearest points of each of points (N, k, s), each scaled.
 
-    Points that are not `present` (N, k) have no neighbours and are none, except where there are too few others.
+    Points that are not `present` (N, k) are no neighbours, except where there are too few others.
     """
     with np.errstate(all="ignore"):
         held = np.where(present[..., None], points, np.nan)

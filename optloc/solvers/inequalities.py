@@ -196,7 +196,7 @@ def _cheapest_found(found: Found, count: int) -> Found:
 
 
 def _in_rows(found: Found, items: Array, size: int) -> Found:
-    """Return the minima of the problems `items` (n,) as those of all `size` problems; the others have none."""
+    """Return the minima of the problems `items` (n,) in arrays for all `size` problems; the others have no minimum."""
     count = found[1].shape[1]
     x = np.full((size, count, found[0].shape[-1]), np.nan)
     cost, refused = (np.full((size, count), np.inf) for _ in range(2))

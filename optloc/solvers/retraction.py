@@ -22,8 +22,8 @@ from optloc.problem.problem import Problem
 _PROJECTIONS = 6
 # Steps of a descent. It converges linearly if the face is bent.
 _STEPS = 60
-# First damping relative to the diagonal of the information, its factors after a good and a bad step, and its limit:
-# the usual values of the method of Levenberg and Marquardt.
+# First damping relative to the diagonal of the information, its factors after a good and a bad step, and its limit.
+# These are usual values of the method of Levenberg and Marquardt.
 _DAMPING, _BETTER, _WORSE, _MOST = 1e-3, 0.3, 5.0, 1e8
 # Expected decrease of chi-square, relative to chi-square plus one, below which a point is a minimum.
 _FLAT = 1e-8
@@ -124,8 +124,8 @@ def _within(problem: Problem, face: Face, x: Array) -> tuple[Array, Array, Array
     along = tangent_at(problem, face, x)
     with np.errstate(all="ignore"):
         information, vector, _ = marginal(equations_at(problem, x))
-    usable = np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1)
+    usable: Array = np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1)
     across = np.swapaxes(along, -1, -2)
-    information = np.where(usable[:, None, None], information, np.eye(x[:, : along.shape[-2]].shape[-1]))
+    information = np.where(usable[:, None, None], information, np.eye(along.shape[-2]))
     vector = np.where(usable[:, None], vector, 0.0)
     return along, across @ information @ along, (across @ vector[..., None])[..., 0]

@@ -46,8 +46,7 @@ def test_candidates_beyond_a_bound_are_refused(held):
 
 
 # Data that contradict a half-plane or a band by hundreds of chi-square: kind, stations, measurements, standard
-# deviation, direction of the normal in degrees, and limits. Descents from the candidates without limits missed the least
-# minimum.
+# deviation, direction of the normal in degrees, and limits. Descents from the free candidates missed the least minimum.
 FAR = {
     "four differences": (
         "tdoa",
