@@ -4,8 +4,8 @@ Candidates of the problem without constraints are far from such a face, and desc
 around the candidates and around the stations are projected onto the face. Those that cost less than their neighbours
 are starts.
 
-Letters: n problems, q candidates or starts of each, k points of each, M points of several problems. A face has c levels.
-A parameter vector has `size` numbers, the first s of which all epochs share.
+Letters: n problems, q candidates or starts of each, k points of each, M points of several problems, f faces with c
+levels. A parameter vector has `size` numbers, the first s of which all epochs share.
 """
 
 from __future__ import annotations
@@ -118,8 +118,9 @@ def spread_along(problem: Problem, sides: list[Face], candidates: Array, rise: A
 
 
 Cloud = tuple[Array, Array, int]
-"""Points (n, k, size), roots of the metric (n, 2, s, s) in which they are projected, and how many points, from the
-first, take the first metric; the others take the second."""
+"""Points (n, k, size), roots (n, 2, s, s) of the two metrics in which they are projected, and a number of points.
+
+That many points, from the first, take the first metric; the others take the second."""
 
 
 def _cloud_in_metric(problem: Problem, candidates: Array, rise: Array) -> Cloud:
