@@ -201,8 +201,19 @@ def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[
     return [list(names).index(table.target) if len(motions) > 1 else 0]
 
 
+def _acting(bands: Sequence[Band], lower: Array, upper: Array) -> Iterator[Band]:
+    """Yield bands on one quantity with its greatest `lower` and least `upper` bound, each under its own name."""
+    below = next(band for band in bands if band.lower == lower)
+    above = next(band for band in bands if band.upper == upper)
+    if not np.isfinite(lower) or not np.isfinite(upper) or below.name == above.name:
+        yield replace(below if np.isfinite(lower) else above, lower=lower, upper=upper)
+        return
+    yield replace(below, upper=np.array(np.inf))
+    yield replace(above, lower=np.array(-np.inf))
+
+
 def _merge(limits: Sequence[Limit]) -> Iterator[Limit]:
-    """Yield the intersection of the bands on each quantity, each polygon and each union once, and all fences."""
+    """Yield the bounds that act on each quantity, each polygon and each union once, and all fences."""
     constraints = [limit for limit in limits if not isinstance(limit, Fence)]
     # Keep two bands that contradict each other: the check of the problem reports them.
     for bands in bands_by_quantity(constraints):
@@ -210,8 +221,10 @@ def _merge(limits: Sequence[Limit]) -> Iterator[Limit]:
             yield from bands  # a batch of bounds, which a Python argument can state
             continue
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
-        if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
+        if np.isnan([lower, upper]).any() or lower >= upper:
             yield replace(bands[0], lower=lower, upper=upper)
+        elif np.isfinite(lower) or np.isfinite(upper):
+            yield from _acting(bands, lower, upper)
     yield from {(c.target, c.outside, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()
     yield from {(c.target, str(c.members)): c for c in constraints if isinstance(c, AnyOf)}.values()
     yield from (limit for limit in limits if isinstance(limit, Fence))

@@ -47,7 +47,8 @@ class PosedAnswer(PosedSolution):
     Parameters
     ----------
     value : float
-        Objective at the solution: chi-square, unless you or the formulation replace it.
+        Objective at the solution: chi-square, unless you or the formulation replace it. For "minimax_cone" it is minus
+        the radius of a ball inside the cones, metres.
     bound : float
         Lower bound of the objective of the convex problem, recomputed from a dual point; NaN without a bound. It bounds
         the cost of maximum likelihood for "moment_sdp" (in its box) and "lifted" only. "direction_sdp" minimises chords

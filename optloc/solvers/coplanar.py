@@ -30,7 +30,7 @@ from optloc.model_checks.coplanar import (
 )
 from optloc.problem.fix import Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden
 from optloc.solvers.policy import LISTED_GAP, SAME_PLACE
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.verdict.minima import measure_curvature, smallest_pivot

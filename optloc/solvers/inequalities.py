@@ -1,31 +1,26 @@
-"""Conditions that an answer must meet: inequalities, and lines of sight that the Earth does not block.
+"""Conditions that an answer must meet: inequalities; a target that the Earth hides from a station is refused too.
 
 If the best candidate breaks an inequality, the cost is minimised along every face of the inequalities. A *face* is a
 set of inequalities that are satisfied with equality.
 
-Letters: N problems, q slots for candidates, k stations, M starts or points of several problems, `size` numbers of a
+Letters: N problems, q slots for candidates, M starts or points of several problems, `size` numbers of a
 parameter vector. Costs are chi-square values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from optloc.base.frames import Frame
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Status
-from optloc.engine.admission import GRAZE, GROUND, SATELLITE
 from optloc.kernels.least_squares import refine
 from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import (
     TOLERANCE,
     Face,
-    Level,
-    band_at,
-    bound_of,
     exact,
     faces,
     is_held,
@@ -34,177 +29,16 @@ from optloc.linear.constraints import (
     violation,
 )
 from optloc.linear.normal import marginal
-from optloc.models import MODELS
-from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.chart import tail_probability
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.around import starts_around
+from optloc.solvers.face_starts import limited_to, spread_along, structure
+from optloc.solvers.horizon import first_sentence, is_hidden, name_hidden
 from optloc.solvers.layered import in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_MISFIT
 from optloc.solvers.pool import Pool
-
-
-def is_hidden(problem: Problem, x: Array, reach: float = 0.0) -> Array:
-    """Return flags (N,) of vectors x (N, size) whose target the Earth hides from a station with a row of it.
-
-    Two kinds of lines are tested. First, lines with one end in space, above 100 km: no wave passes through the Earth
-    into space. Second, lines of rows that are angles: a bearing follows the line of sight. The straight line to a
-    satellite may pass 5 km below the ellipsoid, a line to the ground 50 km. All other rows may connect any two points
-    on the ground: waves of earthquakes pass through the Earth, and radio waves go around it.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems; in plain Cartesian frames nothing is hidden.
-    x : array (N, size)
-        Parameter vectors.
-    reach : float
-        Radius, metres, of a ball that must be hidden as a whole.
-    """
-    out = np.zeros(len(x), dtype=bool)
-    for sight in sights(problem):
-        out |= sight.blocked(x, reach).any(1)
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """The lines of sight from a target to its k stations.
-
-    Parameters
-    ----------
-    frame : Frame
-        Frame of the vectors.
-    part : slice
-        Columns of the position of the target in a parameter vector.
-    station : int array (k,)
-        Numbers of the stations.
-    place : array (N, k, 3)
-        Earth-centred positions of the stations, scaled so that the ellipsoid is the unit sphere.
-    present, angular : bool array (N, k)
-        True if the station has a row in a problem, and if one of its rows is an angle.
-    """
-
-    frame: Frame
-    part: slice
-    station: Array
-    place: Array
-    present: Array
-    angular: Array
-
-    def blocked(self, x: Array, reach: float = 0.0) -> Array:
-        """Return flags (N, k) of stations that the Earth hides from targets at x (N, size).
-
-        `reach` is the radius, metres, of a ball around the target that must be hidden as a whole; see `is_hidden`.
-        """
-        point = self.frame.to_ecef(x[:, self.part]) * _STRETCH
-        return _is_blocked(point[:, None], self.place, self.present, self.angular, reach * float(_STRETCH.max()))
-
-
-# Factors that turn the ellipsoid into the unit sphere; straight lines stay straight.
-_STRETCH = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
-
-
-def sights(problem: Problem) -> list[Sight]:
-    """Return the lines of sight of all targets of a flat batch; empty in plain Cartesian frames."""
-    if not problem.frame.geodetic or problem.dimension != 3:
-        return []
-    found, position = list[Sight](), problem.stations.position
-    place = problem.frame.to_ecef(position if position.ndim == 4 else position[None]) * _STRETCH
-    for target, motion in enumerate(problem.motions):
-        # only targets whose unknown state lasts the run are tested
-        if motion.known is not None or motion.span == "epoch":
-            continue
-        slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
-        epoch, station, measured, angular = _measured_by(problem, target)
-        part = slice(slot.start, slot.start + 3)
-        found.append(Sight(problem.frame, part, station, place[:, epoch, station], measured, angular))
-    return found
-
-
-def _measured_by(problem: Problem, target: int) -> tuple[Array, Array, Array, Array]:
-    """Return the k pairs of epoch and station that measure a target: epochs (k,), stations (k,), and two flags (N, k).
-
-    The first flag is True if the pair has a row in a problem, and the second if it has an angle. If no station moves,
-    all epochs count as epoch 0.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    target : int
-        Number of the target.
-    """
-    moving = problem.stations.position.shape[-3] > 1
-    weight = np.broadcast_to(problem.weight, (problem.batch_shape[0], problem.count))
-    no_rows = np.zeros(len(weight), dtype=bool)
-    found: dict[tuple[int, int], Array] = {}
-    sighted: dict[tuple[int, int], Array] = {}
-    # for each pair (epoch, station): flags (N,) of problems with a row, and of problems with an angle
-    for rows, start in zip(problem.rows, problem.starts, strict=True):
-        present, model = weight[:, start : start + rows.count] > 0.0, MODELS[rows.kind]
-        rows_of_target = np.flatnonzero(rows.target == target).tolist()
-        for index in (rows.a, rows.b)[: model.stations]:
-            for i in rows_of_target:
-                key = (int(rows.epoch[i]) if moving else 0, int(index[i]))
-                found[key] = found.get(key, no_rows) | present[:, i]
-                if model.quantity == "angle":
-                    sighted[key] = sighted.get(key, no_rows) | present[:, i]
-    epoch, station = np.array(list(found), dtype=int).reshape(-1, 2).T
-    measured, angular = (np.empty((len(weight), len(found)), dtype=bool) for _ in range(2))
-    for k, key in enumerate(found):
-        measured[:, k], angular[:, k] = found[key], sighted.get(key, no_rows)
-    return epoch, station, measured, angular
-
-
-def _is_blocked(point: Array, station: Array, present: Array, angular: Array, reach: float) -> Array:
-    """Return flags (...) of lines from point to station that pass too deep below the surface; unit sphere coordinates.
-
-    Parameters
-    ----------
-    point, station : array (..., 3)
-        Ends of the line; the ellipsoid is the unit sphere.
-    present, angular : bool array (...)
-        True if the station has a row, and if one of its rows is an angle.
-    reach : float
-        Further depth that a line must reach to count, in the same unit.
-    """
-    # SATELLITE, GRAZE and GROUND are distances from the centre in Earth radii
-    satellite = (station**2).sum(-1) > SATELLITE**2
-    limit = np.where(satellite, GRAZE, GROUND)
-    line = station - point
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        outside = angular | satellite | ((point**2).sum(-1) > SATELLITE**2)
-        # the point of the segment nearest to the centre; if it is the far end, nothing is in between
-        share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
-        nearest = ((point + share[..., None] * line) ** 2).sum(-1)
-    return np.asarray(present & outside & (share > 0.0) & (nearest < (limit - reach) ** 2))
-
-
-def lowest_sight(problem: Problem, x: Array) -> Array:
-    """Return the sine (N,) of the elevation of the lowest satellite with rows, as seen from targets x (N, size).
-
-    It is zero in plain Cartesian frames and without satellites. It ranks positions that fit equally well.
-    """
-    worst = np.full(len(x), np.inf)
-    if not problem.frame.geodetic or problem.dimension != 3:
-        return np.zeros(len(x))
-    position = np.broadcast_to(problem.stations.position, (len(x), *problem.stations.position.shape[-3:]))
-    stations = problem.frame.to_ecef(position)
-    for target, motion in enumerate(problem.motions):
-        if motion.known is not None or motion.span == "epoch":
-            continue
-        slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
-        point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3])
-        up = np.stack(geodetic_normal((point[:, 0], point[:, 1], point[:, 2])), axis=-1)
-        epoch, station, measured, _ = _measured_by(problem, target)
-        line = stations[:, epoch, station] - point[:, None]
-        high = measured & ((stations[:, epoch, station] ** 2).sum(-1) > (SATELLITE * WGS84_A) ** 2)
-        sine = (line * up[:, None]).sum(-1) / np.sqrt((line**2).sum(-1))
-        worst = np.minimum(worst, np.where(high, sine, np.inf).min(-1, initial=np.inf))
-    return np.where(np.isfinite(worst), worst, 0.0)
-
+from optloc.solvers.retraction import descend_along, is_on
 
 Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
 """Maps problems, starts (M, size), the problem of each start (M,) and a face to points, costs and statuses there."""
@@ -224,11 +58,30 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
     `start` (M, size) are the starts, and `item` (M,) is the problem of each start.
     """
     strata = strata_of(problem, face)
-    if strata is None:
-        done = refine(problem, start, item=item, face=face, limit=_STEPS)
-    else:
+    if strata is not None:
         done = refine_in_layers(problem, strata, start, item, face, _STEPS)
-    return done.x, done.cost, done.status
+        return done.x, done.cost, done.status
+    done = refine(problem, start, item=item, face=face, limit=_STEPS)
+    x, cost, status = done.x, done.cost, done.status
+    # other unknowns of single epochs than emission times would have to be fitted after each projection
+    simple = problem.layout.size == problem.layout.n_shared or bool(problem.emitting)
+    left = np.flatnonzero((status != Status.OK) & ~is_on(problem.take(item), face, x)) if simple and face else []
+    if not len(left):
+        return x, cost, status
+    again, least, code = descend_along(problem.take(item[left]), face, start[left])
+    held = code != Status.NUMERICAL
+    if not held.any():
+        return x, cost, status
+    left, again, least, code = left[held], again[held], least[held], code[held]
+    # the last digits, unless the refinement leaves the face again
+    part = problem.take(item[left])
+    last = refine(part, again, face=face, limit=_STEPS)
+    better = (last.status == Status.OK) & is_on(part, face, last.x) & (last.cost <= least)
+    x, cost, status = x.copy(), cost.copy(), status.copy()
+    x[left] = np.where(better[:, None], last.x, again)
+    cost[left] = np.where(better, last.cost, least)
+    status[left] = np.where(better, np.int8(Status.OK), code)
+    return x, cost, status
 
 
 def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares) -> Pool:
@@ -272,22 +125,13 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
     # finished candidates that noise explains, but that are not admitted: a sentence names those behind the Earth
     refused = np.where(broken & (pool.code == Status.OK) & _fits(pool, pool.cost), pool.cost, np.inf)
     kept = replace(
-        _mark_infeasible(pool, broken), hidden=_first_sentence(_name_hidden(problem, pool.x, refused), pool.hidden)
+        _mark_infeasible(pool, broken), hidden=first_sentence(name_hidden(problem, pool.x, refused), pool.hidden)
     )
     # a feasible cheapest candidate is the answer, and without inequalities there is no other face
     if not len(unanswered) or sides == [exact(problem)]:
         return kept
-    starts, strata = _cheapest(pool, unanswered), strata_of(problem)
-    starts = starts if strata is None else in_every_layer(strata, starts)
-    # face 0 has no inequality, and its minima are in the pool already
-    on_faces = _on_faces(problem, sides, unanswered, starts, descend)
-    size, width = len(pool.x), sum(found[1].shape[1] for found in on_faces)
-    x = np.full((size, width, pool.x.shape[-1]), np.nan)
-    cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
-    face = np.zeros((size, width), dtype=int)
-    refused_on_faces = np.full((size, width), np.inf)
-    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (refused_on_faces, 4)):
-        array[unanswered] = np.concatenate([found[place] for found in on_faces], axis=1)
+    found = _search(problem, pool, kept, sides, unanswered, descend)
+    x, cost, code, face, refused_on_faces = _in_rows(found, unanswered, len(pool.x))
     refused_on_faces = np.where(_fits(pool, refused_on_faces), refused_on_faces, np.inf)
     # the slope of the cost inwards is computed for least squares, so a robust loss is not tested
     if not pool.loss:
@@ -296,12 +140,69 @@ def _bound(problem: Problem, pool: Pool, broken: Array, descend: Descend) -> Poo
         cost, code = np.where(falling, np.inf, cost), np.where(falling, np.int8(Status.INFEASIBLE), code)
     return replace(
         kept,
-        hidden=_first_sentence(kept.hidden, _name_hidden(problem, x, refused_on_faces)),
+        hidden=first_sentence(kept.hidden, name_hidden(problem, x, refused_on_faces)),
         x=np.concatenate([kept.x, x], axis=1),
         cost=np.concatenate([kept.cost, cost], axis=1),
         code=np.concatenate([kept.code, code], axis=1),
         face=np.concatenate([kept.face, face], axis=1),
     )
+
+
+Found = tuple[Array, Array, Array, Array, Array]
+"""Minima on faces: x (n, q, size), and cost, code, face and cost if infeasible (n, q); infinite costs if none."""
+
+# Rise of chi-square above the cheapest candidate from which minima are searched all along the faces: the constraints
+# move the fix by two standard deviations. Below that the least minimum is next to the candidate.
+_RISE = 4.0
+# Minima of the wider search that are kept for each problem, the cheapest.
+_KEPT = 12
+
+
+def _search(problem: Problem, pool: Pool, kept: Pool, sides: list[Face], items: Array, descend: Descend) -> Found:
+    """Return the minima on all faces of the problems `items` (n,), whose cheapest candidate is not admitted.
+
+    `pool` and `kept` are the candidates with and without those that are not admitted, and `sides` are all faces. If the
+    faces cost much more than the cheapest candidate, they are searched along their whole length.
+    """
+    starts, strata = _cheapest(pool, items, _STARTS), strata_of(problem)
+    starts = starts if strata is None else in_every_layer(strata, starts)
+    # face 0 has no inequality, and its minima are in the pool already
+    around = [starts_around(problem, side, items, starts[:, 0]) for side in sides[1:]]
+    wider = [np.concatenate([starts, one], axis=1) for one in around]
+    found = _on_faces(problem, sides, items, wider, descend)
+    inside = np.where(kept.code == Status.OK, kept.cost, np.inf)[items].min(1)
+    least = np.minimum(found[1].min(1, initial=np.inf), inside)
+    finished = np.where((pool.code == Status.OK) & np.isfinite(pool.cost), pool.cost, np.inf)[items].min(1)
+    with np.errstate(invalid="ignore"):
+        rise = np.where(np.isfinite(least), least - finished, np.inf)
+    again = np.flatnonzero((rise > _RISE) & np.isfinite(finished))
+    if not len(again):
+        return found
+    part, candidates = problem.take(items[again]), _cheapest(pool, items[again], pool.x.shape[1])
+    spread = spread_along(part, sides, candidates, rise[again])
+    more = _cheapest_found(_on_faces(problem, sides, items[again], spread, descend), _KEPT)
+    more = _in_rows(more, again, len(items))
+    x, cost, code, face, refused = (np.concatenate(both, axis=1) for both in zip(found, more, strict=True))
+    return x, cost, code, face, refused
+
+
+def _cheapest_found(found: Found, count: int) -> Found:
+    """Return the `count` cheapest minima of each problem."""
+    x, cost, code, face, refused = found
+    order = np.argsort(cost, axis=1, kind="stable")[:, :count]
+    x = np.take_along_axis(x, order[..., None], axis=1)
+    cost, code, face, refused = (np.take_along_axis(one, order, axis=1) for one in (cost, code, face, refused))
+    return x, cost, code, face, refused
+
+
+def _in_rows(found: Found, items: Array, size: int) -> Found:
+    """Return the minima of the problems `items` (n,) in arrays for all `size` problems; the others have no minimum."""
+    count = found[1].shape[1]
+    x = np.full((size, count, found[0].shape[-1]), np.nan)
+    cost, refused = (np.full((size, count), np.inf) for _ in range(2))
+    code, face = np.full((size, count), int(Status.INFEASIBLE), dtype=np.int8), np.zeros((size, count), dtype=int)
+    x[items], cost[items], code[items], face[items], refused[items] = found
+    return x, cost, code, face, refused
 
 
 def _keep_misfits(problem: Problem, before: Pool, broken: Array, pool: Pool) -> Pool:
@@ -350,9 +251,9 @@ def _mark_infeasible(pool: Pool, broken: Array) -> Pool:
     return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 
 
-def _cheapest(pool: Pool, items: Array) -> Array:
-    """Return the cheapest candidates (n, q, size) of problems `items` (n,), q at most `_STARTS`; NaN in empty slots."""
-    order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
+def _cheapest(pool: Pool, items: Array, count: int) -> Array:
+    """Return the cheapest candidates (n, q, size) of problems `items` (n,), q at most `count`; NaN in empty slots."""
+    order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :count]
     x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
     good = np.isfinite(np.take_along_axis(pool.cost[items], order, axis=1))
     return np.where(good[..., None], x, np.nan)
@@ -362,91 +263,65 @@ def _cheapest(pool: Pool, items: Array) -> Array:
 _TOGETHER = 2**14
 
 
-def _on_faces(
-    problem: Problem, sides: list[Face], items: Array, starts: Array, descend: Descend
-) -> list[tuple[Array, ...]]:
-    """Return, for each face but the first, what `_on_alike` returns for it.
+def _on_faces(problem: Problem, sides: list[Face], items: Array, starts: list[Array], descend: Descend) -> Found:
+    """Return the minima on each face but the first, one face after the other.
 
-    `sides` is the list of all faces. `items` (n,) are the numbers of the problems, and `starts` (n, q, size) their
-    starts. Faces with the same quantities are one batch: a road has many of them.
+    `sides` is the list of all faces. `items` (n,) are the numbers of the problems, and `starts` has the starts (n, q,
+    size) on each face but the first. Faces with the same quantities are one batch: a road has many of them.
     """
-    found: dict[int, tuple[Array, ...]] = {}
+    found: dict[int, Found] = {}
     groups: dict[tuple[Hashable, ...], list[int]] = {}
     for number in range(1, len(sides)):
-        groups.setdefault(_structure(problem, sides[number]), []).append(number)
-    most = max(1, _TOGETHER // max(1, 4 * starts.shape[0] * starts.shape[1]))
+        groups.setdefault(structure(problem, sides[number]), []).append(number)
+    most = max(1, _TOGETHER // max(1, len(items) * max((one.shape[1] for one in starts), default=1)))
     for numbers in groups.values():
         for first in range(0, len(numbers), most):
             chosen = numbers[first : first + most]
-            found |= dict(zip(chosen, _on_alike(problem, sides, chosen, items, starts, descend), strict=True))
-    return [found[number] for number in range(1, len(sides))]
-
-
-def _structure(problem: Problem, face: Face) -> tuple[Hashable, ...]:
-    """Return a key of everything but the numbers of the levels of a face."""
-    bands = [(band_at(problem, level), level.epoch) for level in face]
-    return tuple((b.kind, b.target, b.other, b.table, b.coefficients.shape[-1], epoch) for b, epoch in bands)
+            own = [starts[number - 1] for number in chosen]
+            found |= dict(zip(chosen, _on_alike(problem, sides, chosen, items, own, descend), strict=True))
+    ordered = [found[number] for number in range(1, len(sides))]
+    x, cost, code, face, refused = (np.concatenate(parts, axis=1) for parts in zip(*ordered, strict=True))
+    return x, cost, code, face, refused
 
 
 def _on_alike(
-    problem: Problem, sides: list[Face], numbers: list[int], items: Array, starts: Array, descend: Descend
-) -> list[tuple[Array, ...]]:
-    """Return x, cost, code and face (n, q) of the minima on faces, and the costs (n, q) of infeasible minima.
+    problem: Problem, sides: list[Face], numbers: list[int], items: Array, starts: list[Array], descend: Descend
+) -> list[Found]:
+    """Return the minima on faces with the same quantities, one entry for each face.
 
-    `numbers` are the indices in `sides` of faces with the same quantities; the result has one entry for each. `items`
-    and `starts` are as for `_on_faces`; curved faces get more starts. Costs are infinite in all other slots.
+    `numbers` are the indices of these faces in `sides`, and `starts` has the starts (n, q, size) on each of them.
+    `items` are as for `_on_faces`. Costs are infinite in slots without a minimum.
     """
-    wider = [
-        np.concatenate([starts, starts_around(problem, sides[number], items, starts[:, 0])], axis=1)
-        for number in numbers
-    ]
-    places = [np.nonzero(np.isfinite(one).all(-1)) for one in wider]
+    places = [np.nonzero(np.isfinite(one).all(-1)) for one in starts]
     own = np.concatenate([items[row] for row, _ in places])
-    start = np.concatenate([one[place] for one, place in zip(wider, places, strict=True)])
-    part, counts = problem.take(own), [len(row) for row, _ in places]
-    bands, size = [], problem.batch_shape[0]
-    for k in range(len(sides[numbers[0]])):
-        same = [(band_at(problem, sides[n][k]), bound_of(problem, sides[n][k])) for n in numbers]
-        splits = np.split(own, np.cumsum(counts)[:-1])
-        value = np.concatenate([np.broadcast_to(b, (size,))[one] for (_, b), one in zip(same, splits, strict=True)])
-        c = np.concatenate(
-            [
-                np.broadcast_to(band.coefficients, (size, band.coefficients.shape[-1]))[one]
-                for (band, _), one in zip(same, splits, strict=True)
-            ]
-        )
-        bands.append(replace(same[0][0], lower=value, upper=value, coefficients=c))
-    face = tuple(Level(k, "equal", level.epoch) for k, level in enumerate(sides[numbers[0]]))
-    limited = replace(part, constraints=tuple(bands))
+    start = np.concatenate([one[place] for one, place in zip(starts, places, strict=True)])
+    if not len(own):
+        empty = np.zeros(0)
+        return [
+            _filled(n, one, place, start, empty, empty, empty)
+            for n, one, place in zip(numbers, starts, places, strict=True)
+        ]
+    part = problem.take(own)
+    limited, face = limited_to(problem, [sides[n] for n in numbers], own, [len(row) for row, _ in places])
     ends, cost, status = descend(limited, start, np.arange(len(own)), face)
     # bent levels need not meet, and a point on one of them only is no minimum on both
-    missed = np.abs(levels(limited, face, ends)[0])
-    on_levels = (missed <= TOLERANCE * (1.0 + np.abs(np.stack([b.lower for b in bands], axis=1)))).all(1)
+    on_levels = is_on(limited, face, ends)
     # a minimum on a face may break another constraint; the face of both constraints is tried too
     inside = on_levels & (violation(part, ends) <= TOLERANCE) & ~is_hidden(part, ends) & np.isfinite(cost)
     code = np.where(inside, status, np.int8(Status.INFEASIBLE))
     refused = np.where(inside | (status != Status.OK), np.inf, cost)
     out, first = [], 0
-    for number, one, place in zip(numbers, wider, places, strict=True):
+    for number, one, place in zip(numbers, starts, places, strict=True):
         end = first + len(place[0])
-        out.append(
-            _filled(
-                number,
-                one,
-                place,
-                ends[first:end],
-                np.where(inside, cost, np.inf)[first:end],
-                code[first:end],
-                refused[first:end],
-            )
-        )
+        least = np.where(inside, cost, np.inf)[first:end]
+        out.append(_filled(number, one, place, ends[first:end], least, code[first:end], refused[first:end]))
         first = end
     return out
 
 
 def _filled(
     number: int, starts: Array, place: tuple[Array, ...], x: Array, cost: Array, code: Array, refused: Array
-) -> tuple[Array, ...]:
+) -> Found:
     """Return the results of one face in the slots `place` of its `starts` (n, q, size); see `_on_alike`."""
     shape = starts.shape[:2]
     costs, codes = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
@@ -520,81 +395,3 @@ def without_falling(problem: Problem, pool: Pool) -> Pool:
     inside = np.where((pool.code == Status.OK) & ~on_face, pool.cost, np.inf).min(1, initial=np.inf)
     cost = np.where(on_face, pool.cost, np.inf)
     return _mark_infeasible(pool, on_face & _falls(problem, faces(problem), inside, pool.x, cost, pool.face))
-
-
-# Sentences about hidden minima.
-
-# Minima that a sentence locates, and stations that it names for each; further ones are counted.
-_PLACED, _NAMED = 2, 3
-# Relative tolerance for two refinements of one minimum, in Earth-centred coordinates.
-_SAME = 1e-6
-
-
-def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
-    """Return sentences (N,) about minima behind the Earth that break no constraint, or None in plain Cartesian frames.
-
-    Parameters
-    ----------
-    problem : Problem
-        N problems.
-    x : array (N, q, size)
-        Candidates.
-    cost : array (N, q)
-        Their costs; infinite for candidates that were not refused.
-    """
-    if not problem.frame.geodetic or problem.dimension != 3:
-        return None
-    out = np.full(len(x), "", dtype=object)
-    item, slot = np.nonzero(np.isfinite(cost) & np.isfinite(x).all(-1))
-    part, points = problem.take(item), x[item, slot]
-    behind = is_hidden(part, points) & (violation(part, points) <= TOLERANCE)
-    for i in np.unique(item[behind]):
-        slots_of_item = np.flatnonzero(behind & (item == i))
-        out[i] = _describe(problem, points[slots_of_item], cost[i, slot[slots_of_item]], int(i))
-    return out
-
-
-def _first_sentence(one: Array | None, other: Array | None) -> Array | None:
-    """Return the sentences (N,) of `one`; if a sentence is empty, the sentence of `other`.
-
-    If either of the two is None, the result is `one`.
-    """
-    return one if one is None or other is None else np.where(one != "", one, other)
-
-
-def _describe(problem: Problem, x: Array, cost: Array, item: int) -> str:
-    """Return a sentence about minima behind the Earth: costs, positions, and stations that they are hidden from.
-
-    `x` (q, size) and `cost` (q,) are the minima of problem number `item`.
-    """
-    names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
-    slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
-    kept: list[int] = []
-    for i in np.argsort(cost, kind="stable"):
-        if not any(np.abs(x[i] - x[j]).max() <= _SAME * np.abs(x[j]).max() for j in kept):
-            kept.append(int(i))
-    lines = (
-        f"{len(kept)} minima, the best with chi-square {cost[kept[0]]:.3g}, have stations below their horizon"
-        if len(kept) > 1
-        else f"the only minimum found, with chi-square {cost[kept[0]]:.3g}, has stations below its horizon"
-    )
-    places = []
-    for j in kept[:_PLACED]:
-        below = _below(problem, x[j], item)
-        if len(slots) == 1:
-            lat, lon, height = problem.frame.to_geodetic(x[j, slots[0].start : slots[0].start + 3])
-            below = f"{np.degrees(lat):.3f}, {np.degrees(lon):.3f} deg at {height:.4g} m ({below})"
-        places.append(below)
-    return f"{lines}: {'; '.join(places)}" + ("; ..." if len(kept) > _PLACED else "")
-
-
-def _below(problem: Problem, x: Array, item: int) -> str:
-    """Return the names of the stations that the Earth hides from a target, three at most and a count of the others.
-
-    The target is at the vector x (size,) of problem number `item`.
-    """
-    lines = sights(problem.take(np.array([item])))
-    found = sorted({int(one) for sight in lines for one in sight.station[sight.blocked(x[None])[0]]})
-    names = [problem.stations.names[station] for station in found]
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"{', '.join(names[:_NAMED])}{more}"

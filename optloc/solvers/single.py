@@ -56,7 +56,7 @@ from optloc.solvers.certificates.branch_and_bound import (
 from optloc.solvers.certificates.out_of_reach import Edges, ReachWorkspace, are_out_of_reach, edges_of, new_workspace
 from optloc.solvers.certificates.position_cost import matches_problem_cost, surfaces_of
 from optloc.solvers.coplanar import APART
-from optloc.solvers.inequalities import Sight, sights
+from optloc.solvers.horizon import Sight, sights
 from optloc.solvers.methods import Method
 from optloc.solvers.planned import active_of, planned_stages
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, P_MISFIT, P_SUSPECT, REGION_LEVEL, equal_cost

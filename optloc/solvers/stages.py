@@ -31,7 +31,8 @@ from optloc.proof.scope import is_scaled, why_unsupported
 from optloc.solvers.around import starts_on_equalities
 from optloc.solvers.coplanar import join_sides
 from optloc.solvers.formulations import FORMULATIONS
-from optloc.solvers.inequalities import bound_pool, is_hidden
+from optloc.solvers.horizon import is_hidden
+from optloc.solvers.inequalities import bound_pool
 from optloc.solvers.layered import equations_in_layers, in_every_layer, refine_in_layers, strata_of
 from optloc.solvers.policy import P_SUSPECT
 from optloc.solvers.pool import Pool, chunk_size, in_parts, least_finished, offer, pack

@@ -14,7 +14,7 @@ from optloc.engine.plan import plan_of
 from optloc.kernels import jit
 from optloc.linear.constraints import box, height, violation, visible
 from optloc.models.primitives import WGS84_A
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden
 
 pytestmark = pytest.mark.skipif(not jit.enabled(), reason="there are no plans without machine code")
 STATIONS = np.array([[0.0, 0, 0], [10e3, 0, 600], [0, 10e3, 300], [10e3, 10e3, 0], [5e3, 5e3, 900], [2e3, 7e3, 100]])

@@ -9,7 +9,7 @@ from optloc.engine.memory import BY_HEIGHT
 from optloc.engine.plan import plan_of
 from optloc.kernels.jit import enabled
 from optloc.models.primitives import WGS84_A
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden
 from optloc.solvers.starts.position import height_starts
 
 compiled = pytest.mark.skipif(not enabled(), reason="there are no plans without machine code")

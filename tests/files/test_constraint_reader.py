@@ -44,6 +44,24 @@ def test_tables_and_finished_constraints_are_joined():
     assert [c.name for c in found if not isinstance(c, Band)] == ["polyline"]
 
 
+def test_the_bound_that_acts_keeps_its_name():
+    box = constraints.box((0.0, 0.0), (9.0, 9.0))
+    given = [
+        box,
+        constraints.half_plane((0.0, 1.0), 5.0, name="fence"),
+        constraints.half_plane((1.0, 0.0), 99.0, name="no"),
+    ]
+    found, _ = of(stated_arguments(given))
+    assert [(c.name, float(c.lower), float(c.upper)) for c in found] == [
+        ("x", 0.0, 9.0),
+        ("y", 0.0, np.inf),
+        ("fence", -np.inf, 5.0),
+    ]
+    # two bounds that meet are one equality
+    given = [constraints.half_plane((0.0, 1.0), 5.0, name="a"), constraints.band((0.0, 1.0), 5.0, 8.0, name="b")]
+    assert [(float(c.lower), float(c.upper)) for c in of(stated_arguments(given))[0]] == [(5.0, 5.0)]
+
+
 def test_one_constraint_needs_no_list():
     (band,) = constraints.disc((0.0, 0.0), 9.0)
     for given in (band, (band,), [band], {"kind": "disc", "x": 0.0, "y": 0.0, "radius": 9.0}):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from model_checks.small import PLACE, ranges_to
 
 import optloc
 from optloc.base.frames import ECEF
@@ -9,7 +10,7 @@ from optloc.base.types import Status
 from optloc.files.convert import interpret_table
 from optloc.files.table_import import ColumnHints
 from optloc.solvers.certificates.branch_and_bound import BARRED, LOST
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden, lowest_sight
 
 UP = np.array([[1.0, 0.2, 0.1], [0.9, -0.3, 0.3], [0.8, 0.5, -0.3], [0.7, -0.4, -0.5], [0.6, 0.1, 0.8]])
 SATELLITES = 26.6e6 * UP / np.linalg.norm(UP, axis=1)[:, None]
@@ -260,3 +261,30 @@ def test_what_ground_stations_measure_of_a_satellite_has_no_image_behind_the_ear
     assert fix.status != Status.AMBIGUOUS
     found = fix.alternatives.x[np.isfinite(fix.alternatives.gap)]
     assert not is_hidden(problem.take(np.zeros(len(found), dtype=int)) if len(found) else problem.flat(), found).any()
+
+
+RADIUS, HIGH = 6378137.0, 26.6e6
+# satellites over the equator at these longitudes, degrees
+ABOVE = np.radians([0.0, 60.0, 100.0])
+
+
+def from_space():
+    stations = HIGH * np.stack([np.cos(ABOVE), np.sin(ABOVE), 0.0 * ABOVE], axis=-1)
+    rows = optloc.measured("range", np.full(3, 2.3e7), a=np.arange(3), sigma=5.0)
+    return optloc.assemble(stations, rows, frame=ECEF).flat()
+
+
+def test_a_satellite_below_the_horizon_is_hidden():
+    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
+    # from longitude 0 the satellite at 100 degrees is below the horizon, which is 76 degrees away
+    assert is_hidden(problem, ground).tolist() == [True]
+    assert is_hidden(problem.with_rows(weight=np.array([[1.0, 1.0, 0.0]])), ground).tolist() == [False]
+    assert not is_hidden(ranges_to(PLACE, 1.0), PLACE[None]).any()
+
+
+def test_the_lowest_sight_is_the_sine_of_the_elevation():
+    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
+    line = HIGH * np.stack([np.cos(ABOVE), np.sin(ABOVE)], axis=-1) - [RADIUS, 0.0]
+    expected = (line[:, 0] / np.linalg.norm(line, axis=1)).min()
+    assert lowest_sight(problem, ground)[0] == pytest.approx(expected, abs=1e-9)
+    assert lowest_sight(ranges_to(PLACE, 1.0), PLACE[None]).tolist() == [0.0]

@@ -1,4 +1,4 @@
-"""Bounds and the horizon: what the Earth hides, and minima on the faces of a box, against SciPy."""
+"""Bounds: minima on faces, against SciPy and against the cost along a whole face."""
 
 from dataclasses import replace
 
@@ -7,37 +7,11 @@ import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 from scipy.optimize import minimize
 
-from optloc import Status, assemble, constraints, measured
-from optloc.base.frames import ECEF
+from optloc import Status, assemble, constraints, measured, solve
 from optloc.linear.constraints import faces
-from optloc.solvers.inequalities import bound_pool, is_hidden, is_minimum, lowest_sight, without_broken
+from optloc.solvers.inequalities import bound_pool, is_minimum, without_broken
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
-
-RADIUS, HIGH = 6378137.0, 26.6e6
-# satellites over the equator at these longitudes, degrees
-SATELLITES = np.radians([0.0, 60.0, 100.0])
-
-
-def from_space():
-    stations = HIGH * np.stack([np.cos(SATELLITES), np.sin(SATELLITES), 0.0 * SATELLITES], axis=-1)
-    return assemble(stations, measured("range", np.full(3, 2.3e7), a=np.arange(3), sigma=5.0), frame=ECEF).flat()
-
-
-def test_a_satellite_below_the_horizon_is_hidden():
-    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
-    # from longitude 0 the satellite at 100 degrees is below the horizon, which is 76 degrees away
-    assert is_hidden(problem, ground).tolist() == [True]
-    assert is_hidden(problem.with_rows(weight=np.array([[1.0, 1.0, 0.0]])), ground).tolist() == [False]
-    assert not is_hidden(ranges_to(PLACE, 1.0), PLACE[None]).any()
-
-
-def test_the_lowest_sight_is_the_sine_of_the_elevation():
-    problem, ground = from_space(), RADIUS * np.array([[1.0, 0.0, 0.0]])
-    line = HIGH * np.stack([np.cos(SATELLITES), np.sin(SATELLITES)], axis=-1) - [RADIUS, 0.0]
-    expected = (line[:, 0] / np.linalg.norm(line, axis=1)).min()
-    assert lowest_sight(problem, ground)[0] == pytest.approx(expected, abs=1e-9)
-    assert lowest_sight(ranges_to(PLACE, 1.0), PLACE[None]).tolist() == [0.0]
 
 
 @pytest.fixture
@@ -69,3 +43,60 @@ def test_candidates_beyond_a_bound_are_refused(held):
     assert pool.code[0, 0] == Status.INFEASIBLE
     wide = replace(problem, constraints=tuple(constraints.box([0.0, 0.0], [1e3, 1e3])))
     assert bound_pool(wide, free) is free
+
+
+# Data that contradict a half-plane or a band by hundreds of chi-square: kind, stations, measurements, standard
+# deviation, direction of the normal in degrees, and limits. Descents from the free candidates missed the least minimum.
+FAR = {
+    "four differences": (
+        "tdoa",
+        [[-439, -144], [-45, -367], [40, 6], [498, -144], [-284, -6]],
+        ([-305, -401, -160, -94], 60.0, 4.5, (-161.0, -136.0)),
+    ),
+    "six ranges": (
+        "range",
+        [[-268, -90], [-178, -197], [8, -409], [142, -410], [-441, -155], [570, -473]],
+        ([285, 318, 503, 482, 468, 796], 20.0, -34.3, (171.0, 251.0)),
+    ),
+    "five differences": (
+        "tdoa",
+        [[541, -501], [-101, -550], [-108, -271], [-97, 59], [509, -90], [14, -539]],
+        ([-7, -155, -185, -254, -24], 20.0, 171.0, (-62.0, 38.0)),
+    ),
+    "half-plane": (
+        "tdoa",
+        [[482, -572], [224, 221], [-411, -538], [-584, 79], [402, -326], [-116, 479]],
+        ([-670, -7, -180, -235, -451], 20.0, 156.7, (-np.inf, -140.0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAR)
+def test_no_minimum_is_missed_along_an_edge_far_from_the_data(case):
+    kind, places, (z, sigma, heading, limits) = FAR[case]
+    stations, first = np.array(places, dtype=float), 0 if kind == "range" else 1
+    others = {} if kind == "range" else {"b": 0}
+    rows = measured(kind, np.array(z, dtype=float), a=np.arange(first, len(stations)), sigma=sigma, **others)
+    normal = np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading))])
+    fix = solve(assemble(stations, rows, constraints=constraints.band(normal, *limits)))
+    # the cost at points half a metre apart along both edges
+    along = np.arange(-3e3, 3e3, 0.5)[:, None] * [-normal[1], normal[0]]
+    edge = np.concatenate([limit * normal + along for limit in limits if np.isfinite(limit)])
+    away = np.linalg.norm(edge[:, None] - stations, axis=-1)
+    modelled = away if kind == "range" else away[:, 1:] - away[:, :1]
+    assert fix.cost <= (((modelled - z) / sigma) ** 2).sum(-1).min()
+
+
+def test_the_problems_of_a_batch_are_searched_one_by_one():
+    z = np.array([[250.0, 380.0, 420.0], [300.0, 250.0, 500.0], [100.0, 250.0, 490.0]])
+    stations = np.array([[-27.0, 3.0], [282.0, -11.0], [-508.0, -101.0]])
+
+    def solved(ranges):
+        rows = measured("range", ranges, a=np.arange(3), sigma=20.0)
+        return solve(assemble(stations, rows, constraints=constraints.band([0.97, -0.245], -200.0, -190.0)))
+
+    together = solved(z)
+    for i, one in enumerate(z):
+        alone = solved(one)
+        np.testing.assert_allclose(together.position[i], alone.position, atol=1e-6)
+        assert together.code[i] == alone.code

@@ -45,6 +45,7 @@ from optloc.linear.constraints.single_bounds import (
     Face as Face,
     Level as Level,
     band_at as band_at,
+    binds_position as binds_position,
     bound_of as bound_of,
     face_names as face_names,
     is_corner as is_corner,

@@ -22,11 +22,19 @@ def point_of(centre: Any, counts: tuple[int, ...], name: str) -> Array:
     return point
 
 
+# Least radius, metres: a hundred times the violation of a constraint that is accepted. A smaller region is a point, and
+# along its boundary no descent makes progress.
+_LEAST_RADIUS = 1e-4
+
+
 def radius_of(radius: Any, name: str) -> float:
-    """Return a radius in metres; raise if it is not positive."""
+    """Return a radius in metres; raise if it is not positive, or so small that the region is a point."""
     size = float(metres(radius, name))
     if not 0.0 < size < np.inf:
         raise InvalidProblem(f"the radius is {size:g} m", name, "give a positive number of metres")
+    if size < _LEAST_RADIUS:
+        advice = f"give at least {_LEAST_RADIUS:g} m, or for a known point a box with equal limits"
+        raise InvalidProblem(f"the radius is {size:g} m, so that the region is a point", name, advice)
     return size
 
 

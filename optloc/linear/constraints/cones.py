@@ -44,8 +44,12 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array, information:
         Information of the shared unknowns, which makes their units comparable.
     """
     gradients = levels(problem, face, x)[1]
+    # beyond every finite distance nothing has a gradient, and nothing is a minimum
+    out: Array = np.isfinite(gradients).all((-1, -2)) & np.isfinite(descent).all(-1)
+    gradients, descent = np.where(out[:, None, None], gradients, 0.0), np.where(out[:, None], descent, 0.0)
+    if information is not None:
+        out &= np.isfinite(information).all((-1, -2))
     share = (np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ descent[..., None])[..., 0]
-    out = np.ones(len(x), dtype=bool)
     for i, level in enumerate(face):
         constraint = problem.constraints[level.constraint]
         if not is_exact(constraint):

@@ -46,7 +46,7 @@ from optloc.solvers.certificates.position_cost import (
     surfaces_of,
     why_unlimited,
 )
-from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.horizon import is_hidden
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Pool, TriedBefore, offer, pack
 from optloc.solvers.stages import lsr

@@ -40,6 +40,8 @@ class ConicStatement:
         Returns the distance of the solution from a point; near zero means exact.
     within : str
         Limits of the unknowns that the formulation adds, as the end of a sentence; "" without any.
+    at_limit : callable
+        Returns whether the solution is on these limits.
     at_height : bool
         Whether the formulation itself keeps the exact height of the problem.
     nowhere : str
@@ -59,6 +61,7 @@ class ConicStatement:
     residual: Any = None
     missing: Mapping[str, str] = field(default_factory=dict)
     within: str = ""
+    at_limit: Callable[[], bool] = lambda: False
     at_height: bool = False
     nowhere: str = "no point meets the posed problem"
     settings: Mapping[str, float] = field(default_factory=dict)

@@ -304,7 +304,7 @@ class Posed(PosedProblem, ABC):
         without += ["your objective"] if self.own_objective else []
         reason = f"refined without {' and '.join(without)}"
         if not bool(fix.answered):
-            return replace(fix, reason=_joined(fix.reason, reason), posed=answer)
+            return replace(fix, reason=with_reason(fix.reason, reason), posed=answer)
         first = Status.UNPROVEN if int(fix.code) in (Status.OK, Status.CURVED) else Status(int(fix.code))
         return _marked(fix, first, f"{reason}; {fix.reason[()]}".rstrip("; "), answer)
 
@@ -325,7 +325,7 @@ class Posed(PosedProblem, ABC):
                 failed = code == Status.NUMERICAL
                 why = f"the posed problem has no solution by {answer.backend}" if failed else reason
                 text = f"{why}; the starts are of the method 'auto'"
-                return replace(fix, reason=_joined(fix.reason, text), posed=replace(answer, refined=False))
+                return replace(fix, reason=with_reason(fix.reason, text), posed=replace(answer, refined=False))
         return self._failed(code, reason, answer)
 
     def _changes(self) -> str:
@@ -392,7 +392,7 @@ def _constraints(names: Collection[str]) -> str:
     return f"constraint{'s' if len(names) > 1 else ''} {quoted}"
 
 
-def _joined(reason: Any, more: str) -> Array:
+def with_reason(reason: Any, more: str) -> Array:
     """Return the reason of a fix, extended by a sentence, as an array without axes."""
     out = np.empty((), dtype=object)
     out[()] = f"{reason[()]}; {more}" if reason[()] else more

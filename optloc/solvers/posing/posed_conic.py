@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.posing.convex_constraints import HalfSpace, as_convex
 from optloc.solvers.posing.convex_program import ConvexProgram
 from optloc.solvers.posing.convex_statement import ConicStatement
-from optloc.solvers.posing.posed import Posed, SolveRequest, numbers_of_start
+from optloc.solvers.posing.posed import Posed, SolveRequest, numbers_of_start, with_reason
 from optloc.solvers.posing.posed_problem import Relation
 
 # Difference, relative to the gradient, up to which a relation is linear in the position alone: rounding of the probe.
@@ -125,6 +126,9 @@ class PosedConic(Posed):
 
     def _solve(self, request: SolveRequest) -> Fix:
         """Return the judged fix; see `Posed.solve`."""
+        unknown = [name for name in request.duals or {} if name not in self.relations]
+        if unknown:
+            raise InvalidProblem(f"there is no constraint {unknown[0]!r}", "duals", "use fix.posed.duals")
         earlier = getattr(request.start, "posed", request.start)
         if not (request.start is None or isinstance(earlier, PosedAnswer)):
             layout = self.stated.layout
@@ -146,7 +150,11 @@ class PosedConic(Posed):
             )
             return self._failed(Status.NUMERICAL, text, answer)
         if solved:
-            return self._conclude(self.statement.read(), answer, request.refine)
+            fix = self._conclude(self.statement.read(), answer, request.refine)
+            if not (self.own_objective and self.statement.at_limit()):
+                return fix
+            text = f"the optimum of your objective is on the edge of the search, {self.statement.within}"
+            return replace(fix, reason=with_reason(fix.reason, text))
         return self._explain_failure(answer, request.refine)
 
     def _explain_failure(self, answer: PosedAnswer, refine: bool | None) -> Fix:

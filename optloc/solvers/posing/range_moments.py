@@ -22,6 +22,8 @@ from optloc.solvers.starts.position import height_sights, spread_of
 # Positions are in the box of moments if their chi-square is at most this far above the chi-square of the fix. So a
 # constraint may move the optimum by four standard deviations. A larger box is less tight.
 _MARGIN = 16.0
+# Distance from a side of the box, whose half-width is one, at which a solution is on it: above the error of Clarabel.
+_EDGE = 1e-4
 # Fraction of the step to the boundary of the cones that Clarabel takes. At its default, 0.99, iterates are so near the
 # boundary that duals of moments, whose equalities depend on each other, are wrong by up to 2e-4.
 _STEP = 0.8
@@ -69,6 +71,7 @@ def pose_moments(problem: Problem, locate: Locate) -> ConicStatement:
         },
         residual=data.white @ first,
         within=f"in the box of positions whose chi-square is at most {_MARGIN:g} above the chi-square of the fix",
+        at_limit=lambda: bool((np.abs(y.value[place[0, 1:]]) >= 1.0 - _EDGE).any()),
         read=read,
         rank_ratio=lambda: rank_ratio(y.value[place]),
         settings={**settings_of(), **tight("CLARABEL", 1e-9, max_step_fraction=_STEP)},

@@ -113,6 +113,8 @@ def decide_statuses(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         reason[i] = _too_few_sentence(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
         reason[i] = f"the target is too far away: {distance[i]:.3g} times the size of the station array from its middle"
+        if code[i] != Status.UNBOUNDED and distance[i] < 1.0:  # inside the array, distance is no reason
+            reason[i] = "the refinement did not end: the cost still falls, in shorter and shorter steps"
     for i in np.flatnonzero(weak):
         reason[i] = _undetermined_sentence(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)

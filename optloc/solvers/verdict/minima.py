@@ -24,7 +24,7 @@ from optloc.model_checks.scaled_rows import runs_backwards
 from optloc.problem.fix import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import lowest_sight
+from optloc.solvers.horizon import lowest_sight
 from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, WEAK, equal_cost
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of, spread_of

@@ -41,6 +41,7 @@ BAD = {
     "a centre in space": (lambda: constraints.disc([0.0, 0.0, 0.0], 5.0), "give 2 coordinates"),
     "an infinite centre": (lambda: constraints.ball([0.0, np.inf], 5.0), "not finite"),
     "no radius": (lambda: constraints.keep_out_disc([0.0, 0.0], 0.0), "the radius is 0 m"),
+    "a point as a disc": (lambda: constraints.disc([0.0, 0.0], 1e-9), "so that the region is a point"),
     "an annulus inside out": (lambda: constraints.annulus([0.0, 0.0], 5.0, 4.0), "contradict each other"),
     "no direction": (lambda: constraints.half_plane([0.0, 0.0], 5.0), "no direction"),
     "a band inside out": (lambda: constraints.band([1.0, 0.0], 5.0, 4.0), "contradict each other"),

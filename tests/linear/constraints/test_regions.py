@@ -69,6 +69,9 @@ def test_a_bound_that_changes_nothing_leaves_the_fix_and_its_status():
         constraints.keep_out_disc(TARGET + np.array([300.0, 0.0]), 50.0),
         constraints.polyline(TARGET + np.array([[-300.0, -300.0], [0.0, 10.0], [300.0, 300.0]]), 200.0),
         constraints.keep_out_polygon(TARGET + np.array([[200.0, 0.0], [300.0, 0.0], [300.0, 90.0]])),
+        constraints.disc([0.0, 0.0], 1e12),
+        constraints.keep_out_disc([-1.5e12, 0.0], 1e12),
+        constraints.polyline([[0.0, 0.0], [100.0, 0.0]], 1e9),
     ):
         fix = solve(ranges_to(TARGET, limits))
         assert (str(fix.status), fix.active[()]) == ("ok", ())

@@ -1,5 +1,6 @@
 """Posed moments, lifts and heights."""
 
+import cvxpy
 import numpy as np
 import pytest
 from solvers.posing.scenes import differences, levelled, ranged, sighted
@@ -21,6 +22,21 @@ def test_moments_reach_the_cost_of_the_fix_and_name_their_box():
     beyond = posed.solve()
     assert beyond.status == Status.INFEASIBLE
     assert "in the box of positions" in str(beyond.reason)
+
+
+def test_an_objective_that_ends_on_the_edge_of_the_box_says_so():
+    posed = pose(ranged(2), "moment_sdp")
+    posed.minimise(posed.position[0])
+    assert "on the edge of the search, in the box of positions" in str(posed.solve().reason)
+    inside = pose(ranged(2), "moment_sdp")
+    place = np.array(solve(ranged(2)).position)
+    inside.minimise(cvxpy.sum_squares((inside.position - place) / inside.unit))
+    assert "on the edge" not in str(inside.solve().reason)
+
+
+def test_duals_of_an_unknown_constraint_are_refused():
+    with pytest.raises(InvalidProblem, match="no constraint 'quay'"):
+        pose(ranged(2), "moment_sdp").solve(duals={"quay": 1.0})
 
 
 def test_lifted_ranges_are_rows_of_ranges():
