@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.types import Status
 from optloc.model_checks.determine import determined, of_fix
 from optloc.problem.determined import Determined
 from optloc.problem.fix import Fix

@@ -34,7 +34,7 @@ def placement_axes(
     found : Placement
         Result of `optloc.place`.
     selection : SiteSelection, optional
-        The selection that was passed to `optloc.place`; by default the one in `found`.
+        The selection that was passed to `optloc.place`; by default `found.selection`.
     ax : matplotlib.axes.Axes, optional
         Where the map is drawn; by default in a new figure.
     title : str

@@ -103,7 +103,7 @@ def problem_axes(problem: Problem, *, ax: Axes | None = None, title: str = "") -
 
 
 def _problem_of(fix: Fix) -> Problem:
-    """Return the problem that a fix refers to, of a batch the first one; raise InvalidProblem if there is none."""
+    """Return the problem that a fix refers to, of a batch the first; raise InvalidProblem without a problem."""
     sources = [] if fix.source is None else fix.source.ravel().tolist()
     known = [source.problem for source in sources if source is not None]
     if not known:

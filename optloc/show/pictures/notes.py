@@ -65,8 +65,8 @@ def scale_bar(panel: Axes, unit: str, taken: str = "") -> None:
 def separate_notes(figure: Figure, panels: Sequence[Axes] | None = None) -> None:
     """Move the notes of a finished figure, or of some panels, so that none covers another note or a mark.
 
-    A note stays in its panel. It takes the first free position around its point. If no position is free, it takes
-    the one that covers the fewest others.
+    A note stays in its panel. It takes the first free position around its point. If no position is free, it covers
+    as few others as possible.
     """
     from matplotlib.text import Annotation
 
@@ -111,7 +111,7 @@ def _move_to_free_place(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
     """Move a note to its first free position, and return its box there.
 
     A position is free if it is inside the panel and does not overlap the boxes `taken`. If no position is free, the
-    note takes the position in the panel that overlaps the fewest boxes; without such a position, the first one.
+    note takes the position in the panel that overlaps the fewest boxes; without such a position, the first.
     """
     inside, best, fewest = panel.get_window_extent(), _PLACES[0], len(taken) + 1
     for place in _PLACES:

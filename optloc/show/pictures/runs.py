@@ -266,7 +266,7 @@ def _bias_panel(panel: Axes, times: Array, found: _Estimates, truth: Array | Non
 
 
 def _final_value(values: Array, sigma: Array, unit: str) -> str:
-    """Return the last known estimate with its standard deviation and unit as text; "unknown" if there is none."""
+    """Return the last known estimate with its standard deviation and unit as text; "unknown" without an estimate."""
     known = np.flatnonzero(np.isfinite(values) & np.isfinite(sigma))
     if not len(known):
         return "unknown"

@@ -508,7 +508,7 @@ def _bound_with(
     """Return the map of the bound with the stations of a mask (s,).
 
     `single` is the problem of all candidates, and `truth` are its unknowns at one place. `grid` are the grid lines in
-    x and y, `height` is the height of the map, m, and `end` (m,) are the stations of the rows.
+    x and y. `height` is the height of the map, m. `end` (m,) are the stations of the rows.
     """
     return bound_map(single.with_rows(weight=single.weight * mask[end]), truth, *grid, height)
 
