@@ -7,6 +7,8 @@ from typing import Any
 
 from sphinx_gallery.scrapers import figure_rst
 
+from optloc.show.pictures.style import description
+
 
 def figures(block: tuple[Any, ...], variables: dict[str, Any], conf: dict[str, Any]) -> str:
     """Write the example's ``figure`` for its page, and return the text that shows it."""
@@ -15,4 +17,4 @@ def figures(block: tuple[Any, ...], variables: dict[str, Any], conf: dict[str, A
         return ""
     path = Path(next(variables["image_path_iterator"]))
     figure.savefig(path, dpi=110)
-    return str(figure_rst([str(path)], conf["src_dir"], figure.get_suptitle()))
+    return str(figure_rst([str(path)], conf["src_dir"], description(figure)))

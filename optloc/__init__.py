@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from optloc.base.faces import exported
 from optloc.base.moved import MOVED, moved, watch_old_packages
+from optloc.base.plots import set_plots
 from optloc.base.short_form import set_short_forms
 from optloc.problem.fix import set_renderer
 from optloc.problem.problem import Problem
@@ -85,6 +86,8 @@ set_renderer(lambda: import_module("optloc.show.fixes"))
 # Neighbours describe their own values; the folder `show` describes the values of the core.
 _FORMS = {"sites": "optloc.sites.site_forms"}
 set_short_forms(lambda folder: import_module(_FORMS.get(folder, "optloc.show.short_forms")))
+# Neighbours draw their own values; the folder `show` draws the values of the core.
+set_plots(lambda folder: import_module("optloc.sites.site_plots" if folder == "sites" else "optloc.show.plots"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

@@ -147,7 +147,8 @@ def test_two_unknown_targets_have_no_single_position():
 @pytest.mark.parametrize("unknown", [0, 2])
 def test_a_picture_has_the_lines_of_the_unknown_target(unknown):
     pytest.importorskip("matplotlib")
-    from optloc.show.pictures.fixes import lines_of_position, plot_fixes
+    from optloc.show.pictures.fixes import plot_fixes
+    from optloc.show.pictures.position_lines import lines_of_position
 
     problem, _ = with_known(("toa",), unknown)
     fix = solve(problem)

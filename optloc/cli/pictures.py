@@ -101,7 +101,8 @@ def _biases(request: PictureRequest) -> None:
     from optloc.solvers.running import growing
 
     loaded, problem, fix = _solve_all(request)
-    write_picture(plot_biases(growing(problem, fix), loaded.title), request.out)
+    units = {slot.name: loaded.bias_unit(slot.name, slot.unit) for slot in problem.layout.shared if slot.members}
+    write_picture(plot_biases(growing(problem, fix), loaded.title, units=units), request.out)
 
 
 def _bound(request: PictureRequest) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         ecef_to_geodetic as ecef_to_geodetic,
         geodetic_to_ecef as geodetic_to_ecef,
     )
+    from optloc.base.plots import plot_of as plot_of
     from optloc.base.registry import (
         Registry as Registry,
         load_plugin as load_plugin,

@@ -14,6 +14,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, status_named, too_weak, whole_redundancy
 from optloc.base.frames import Frame
+from optloc.base.plots import plot_of
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
 from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
@@ -27,6 +28,7 @@ from optloc.problem.state_order import components, in_order
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes as PlotAxes
 
 TOLD = 0.95  # greatest probability level at which the region of a fix with the finding `tails` is valid
 _STATES = ("position", "velocity", "acceleration")
@@ -157,7 +159,7 @@ class Fix:
     posed : PosedAnswer, optional
         Values, duals and solver report of a single fix from `optloc.pose`; None for other fixes.
     source : object array (...), optional
-        A `Source` for `determined`; None for fixes with status `ok`, and in batches where many fixes have another
+        A `Source` for `determined` and `plot`; in batches None for fixes with status `ok`, or if many have another
         status.
     """
 
@@ -408,6 +410,10 @@ class Fix:
             If the positions are not on Earth.
         """
         return dict(_RENDERER[0]().geojson_of(self, problem))
+
+    def plot(self, problem: Problem | None = None, **options: Any) -> PlotAxes:
+        """Return a plan in matplotlib axes; see `optloc.show.fix_axes` for the options."""
+        return plot_of(self, problem=problem, **options)
 
     def gaussian(self) -> tuple[Array, Array]:
         """Return the mean (..., n) and covariance (..., n, n) of the shared unknowns, for the start of a tracker.

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.arrays import as_array_like, library
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
+from optloc.base.plots import plot_of
 from optloc.base.short_form import HasShortForm
 from optloc.base.types import (
     AnyOf,
@@ -38,6 +39,9 @@ from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 from optloc.problem.straight_phases import straight_s_rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, repr=False)  # without slots, because the cached properties need `__dict__`
@@ -90,6 +94,10 @@ class Problem(HasShortForm):
             kept = tuple(c for c in given if not isinstance(c, Fence))
             object.__setattr__(self, "constraints", kept)
             object.__setattr__(self, "fences", (*self.fences, *stated))
+
+    def plot(self, **options: Any) -> Axes:
+        """Return a plan in matplotlib axes; see `optloc.show.problem_axes` for the options."""
+        return plot_of(self, **options)
 
     @property
     def dimension(self) -> int:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from optloc.show.maps.map_pages import fix_page as fix_page, live_page as live_page, track_page as track_page
     from optloc.show.page import PagePart as PagePart, write_page as write_page
     from optloc.show.pictures.bound_map import (
+        BOUND as BOUND,
         COLOURS as COLOURS,
         levels as levels,
         map_geojson as map_geojson,
@@ -36,8 +37,10 @@ if TYPE_CHECKING:
         plot_status_map as plot_status_map,
         status_geojson as status_geojson,
     )
+    from optloc.show.pictures.fix_axes import fix_axes as fix_axes, problem_axes as problem_axes
     from optloc.show.pictures.fixes import plot_fixes as plot_fixes
     from optloc.show.pictures.landscape import plot_convergence as plot_convergence, plot_landscape as plot_landscape
+    from optloc.show.pictures.notes import separate_notes as separate_notes
     from optloc.show.pictures.outlines import earth_points as earth_points
     from optloc.show.pictures.residuals import plot_health as plot_health, plot_residuals as plot_residuals
     from optloc.show.pictures.runs import (
@@ -52,12 +55,16 @@ if TYPE_CHECKING:
         GREY as GREY,
         ORANGE as ORANGE,
         PURPLE as PURPLE,
+        SMALL as SMALL,
+        WIDE as WIDE,
+        axes_or_new as axes_or_new,
+        description as description,
         figure_class as figure_class,
         literal as literal,
         save as save,
-        separate_notes as separate_notes,
     )
     from optloc.show.pictures.track import plot_tracks as plot_tracks
+    from optloc.show.pictures.track_axes import track_axes as track_axes
     from optloc.show.sheet import ABSENT as ABSENT, Sheet as Sheet, TextTable as TextTable
 
 if not TYPE_CHECKING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.types import Status
 from optloc.model_checks.determine import determined, of_fix
 from optloc.problem.determined import Determined
 from optloc.problem.fix import Fix
@@ -34,14 +35,14 @@ def html_of(fix: Fix) -> str:
 def determined_of(fix: Fix) -> Determined | None:
     """Return the quantities that the data of a single fix determine; raise InvalidProblem for a batch.
 
-    If the fix does not refer to its problem, only the intervals of an `ok` fix are known; otherwise the result is None.
+    Of an `ok` fix only the intervals are stated. If another fix does not refer to its problem, the result is None.
     The first call computes the quantities, and the fix keeps them for later calls.
     """
     if fix.shape:
         advice = "select one fix: fix[i].determined"
         raise InvalidProblem(f"a batch of shape {fix.shape} has no single `determined`", "determined", advice)
     source: Any = None if fix.source is None else fix.source[()]
-    if source is None:
+    if source is None or int(fix.code) == Status.OK:
         return of_fix(fix)
     if source.found is None:
         source.found = determined(source.problem.flat(), fix)

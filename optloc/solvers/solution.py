@@ -97,9 +97,10 @@ _KEPT = 8
 
 
 def with_sources(problem: Problem, fix: Fix) -> Fix:
-    """Return the fixes; fixes that are not `ok` store their problems for later advice, if there are at most `_KEPT`."""
-    if not fix.shape and int(fix.code) == Status.OK:
-        return fix
+    """Return the fixes with their problems for pictures and later advice.
+
+    A single fix stores its problem. In a batch, fixes that are not `ok` do, if there are at most `_KEPT`.
+    """
     if not fix.shape and not problem.batch_shape:  # a copy of the problem would take as long as the fix
         source_of_one = np.empty((), dtype=object)
         source_of_one[()] = Source(problem)

@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.errors import NUMERICAL, InvalidProblem
+from optloc.base.plots import plot_of
 from optloc.base.short_form import HasShortForm
 from optloc.base.types import Array, Motion, Status
 from optloc.kernels.filter import CODE, GENERAL, Move
@@ -25,6 +27,9 @@ from optloc.problem.state_order import in_order
 from optloc.tracking.dynamics import Dynamics
 from optloc.tracking.scan_rows import Scans
 from optloc.tracking.updates import Filter, Update, Updated, filter_of, read
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Smallest eigenvalue of a singular covariance after rounding, as a share of its largest entry.
 _NEGATIVE = 1e-9
@@ -109,6 +114,10 @@ class Track(HasShortForm):
             If the state has no component of this name.
         """
         return in_order(order, self.dimension, self.mean, self.cov)
+
+    def plot(self, problem: Problem | None = None, **options: Any) -> Axes:
+        """Return a plan, or another picture, in matplotlib axes; see `optloc.show.track_axes` for the options."""
+        return plot_of(self, problem=problem, **options)
 
     @property
     def last(self) -> State:

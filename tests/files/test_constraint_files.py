@@ -14,7 +14,7 @@ from optloc.cli import app
 from optloc.files import from_table, load, read
 from optloc.files.writer import write_measured
 from optloc.show.pictures import plot_fixes
-from optloc.show.pictures.style import scene_of
+from optloc.show.pictures.scene import scene_of
 
 RUN = CliRunner()
 PLACES = {"A": (0, 0, 30), "B": (4000, 300, 0), "C": (200, 5000, 80), "D": (4100, 4700, 10)}

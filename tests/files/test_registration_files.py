@@ -16,7 +16,7 @@ from optloc.cli import app
 from optloc.cli.file_fixes import fix_file
 from optloc.files import load, read
 from optloc.show.pictures import plot_course, plot_fixes
-from optloc.show.pictures.style import scene_of
+from optloc.show.pictures.scene import scene_of
 
 DEMO = package_files("optloc") / "scenarios" / "registration.toml"
 RUN = CliRunner()

@@ -290,7 +290,7 @@ def test_a_batch_computes_nothing_and_keeps_few_problems():
 def test_an_ok_fix_has_its_coordinates():
     anchors = {"A": (0.0, 0.0), "B": (8.0, 0.0), "C": (0.0, 6.0), "D": (8.0, 6.0)}
     fix = optloc.locate(anchors, ranges={"A": 5.01, "B": 5.02, "C": 4.98, "D": 5.01}, sigma=0.05)
-    assert fix.source is None
+    assert fix.source[()].found is None
     x, y = fix.determined.quantities
     np.testing.assert_allclose([x.low, y.high], fix.position + np.array([-1, 1]) * 1.95996 * fix.sigma(), rtol=1e-4)
     assert fix.to_dict()["determined"] is None

@@ -14,8 +14,8 @@ from sites.calibration.scenes import DEGENERATE, HALL, degenerate, distances, ha
 
 from optloc import Status, calibrate
 from optloc.sites.calibration import network_of
-from optloc.sites.calibration.calibrated import refuted_blocks, spans
-from optloc.sites.calibration.gauge import determined
+from optloc.sites.calibration.calibrated import refuted_blocks
+from optloc.sites.calibration.gauge import determined, spans
 from optloc.sites.calibration.likelihood import likelihood
 from optloc.sites.calibration.outliers import truncated
 from optloc.sites.calibration.restarts import starts_of

@@ -12,8 +12,9 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.maps.map_marks import SKY
 from optloc.show.maps.projection import Window
-from optloc.show.pictures.fixes import lines_of_position
-from optloc.show.pictures.style import figure_class, scene_of, thinned
+from optloc.show.pictures.position_lines import lines_of_position
+from optloc.show.pictures.scene import scene_of, thinned
+from optloc.show.pictures.style import figure_class
 
 # Points along an axis of the grid on which lines of position are traced: 112 steps across the map. The grid extends
 # beyond each side by `_REACH` times the width, for windows that are wider or taller than the map. One batch evaluates

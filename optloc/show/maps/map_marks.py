@@ -16,7 +16,7 @@ from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED
 from optloc.show.maps.canvas import MapRow
 from optloc.show.pictures.outlines import level_planes
-from optloc.show.pictures.style import is_local, regions_of, states_of
+from optloc.show.pictures.scene import is_local, regions_of, states_of
 from optloc.uncertainty.outline import Outline
 
 # Corners of an ellipse: one for every five degrees; the last corner repeats the first.

@@ -10,8 +10,9 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.bounds.over_area import BoundMap, Grid
+from optloc.show.pictures.notes import separate_notes
 from optloc.show.pictures.outlines import feature, line_geometry, point_geometry
-from optloc.show.pictures.style import BLACK, GREY, figure_class, literal, separate_notes
+from optloc.show.pictures.style import BLACK, GREY, SMALL, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from optloc.solvers.shares import StatusMap
+
+BOUND = "bound of the position error (m)\n(darker: larger error)"
+"""Label of the colour scale of a bound."""
 
 COLOURS = "GnBu"
 """Colour map from light to dark in one hue: readable in grey and with any colour vision, below black lines."""
@@ -87,7 +91,8 @@ def plot_status_map(found: StatusMap, title: str = "") -> Figure:
     from matplotlib.colors import Normalize
 
     values = 100.0 * found.shares.of(Status.OK)
-    return _draw(found.grid, values, list(_SHARES), Normalize(0.0, 100.0), "fixes with status ok (%)", title)
+    name = "fixes with status ok (%)\n(darker: more fixes)"
+    return _draw(found.grid, values, list(_SHARES), Normalize(0.0, 100.0), name, title)
 
 
 def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: str, title: str) -> Figure:
@@ -107,7 +112,7 @@ def _draw(grid: Grid, values: Array, steps: list[float], norm: Normalize, name: 
     crossed = [step for step in steps if np.nanmin(values) < step < np.nanmax(values)]
     if crossed:
         lines = axes.contour(x, y, values, levels=crossed, colors=BLACK, linewidths=0.8)
-        axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
+        axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=SMALL)
     _mark_stations(axes, grid.stations * scale, grid.names, x, y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
@@ -133,7 +138,9 @@ def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, 
     inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
     for place, text in zip(stations[inside], np.array(names)[inside], strict=True):
         if len(names) <= _NAMED:
-            note = axes.annotate(literal(str(text)), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
+            note = axes.annotate(
+                literal(str(text)), place, (4, 5), textcoords="offset points", fontsize=SMALL, zorder=5
+            )
             note.set_bbox({"facecolor": "white", "edgecolor": GREY, "alpha": 0.75, "pad": 1, "linewidth": 0.4})
 
 
@@ -150,7 +157,7 @@ def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
     if not np.isfinite(values).any():
         advice = "add rows, or choose another height or place"
         raise InvalidProblem("the geometry is singular everywhere on the map", "map", advice)
-    return values, "dilution of precision" if dilution else "bound of the position error (m)"
+    return values, "dilution of precision\n(darker: larger error)" if dilution else BOUND
 
 
 def levels(values: Array) -> list[float]:

@@ -15,21 +15,10 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.pictures import style
 from optloc.show.pictures.bound_map import levels
-from optloc.show.pictures.fixes import draw_lines, lines_of_position
-from optloc.show.pictures.style import (
-    BLACK,
-    BLUE,
-    ORANGE,
-    PLAN,
-    YELLOW,
-    PictureScene,
-    figure_class,
-    finish,
-    placed_points,
-    scene_of,
-    separate_notes,
-    unit_of,
-)
+from optloc.show.pictures.notes import scale_bar, separate_notes
+from optloc.show.pictures.position_lines import draw_lines, lines_of_position
+from optloc.show.pictures.scene import PLAN, PictureScene, placed_points, scene_of
+from optloc.show.pictures.style import BLACK, BLUE, ORANGE, SMALL, WIDE, YELLOW, figure_class, finish, unit_of
 from optloc.solvers.landscape import Basins, End, basins, profile_cost
 
 if TYPE_CHECKING:
@@ -49,7 +38,7 @@ _CHI2_95 = 5.991464547107979
 # Half the side of the panel around the fix, in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and
 # a margin.
 _AROUND = 4.2
-_NAME = "root of the cost minus the cost of the fix (standard deviations)"
+_NAME = "root of the excess cost (standard deviations)\n(darker: better fit)"
 # Maximum number of rows times starts in one batch, limited by memory; and the resulting limits of the starts along a
 # side.
 _ROWS, _STARTS = 4e6, (31, 161)
@@ -90,7 +79,7 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     """
     flat, answer = single(problem, fix)
     scene = scene_of(flat, [answer])
-    figure = figure_class()(figsize=(12.0, 5.4), layout="constrained")
+    figure = figure_class()(figsize=(WIDE, 6.2), layout="constrained")
     whole, near = figure.subplots(1, 2)
     _draw_overview(whole, flat, answer, scene)
     _draw_surroundings(near, flat, answer, scene)
@@ -170,7 +159,9 @@ def _draw_overview(panel: Axes, problem: Problem, fix: Fix, scene: PictureScene)
     style.points(panel, scene, PLAN, size)
     _set_plan_axes(panel, scene, corners / size, unit)
     panel.set_title("overview" if problem.dimension == 2 else "overview, at the height of the fix")
-    bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
+    bar = panel.figure.colorbar(
+        drawn, ax=panel, label=_NAME, location="bottom", ticks=steps, format=lambda value, _: f"{value:g}"
+    )
     bar.ax.minorticks_off()
 
 
@@ -193,7 +184,7 @@ def _draw_surroundings(panel: Axes, problem: Problem, fix: Fix, scene: PictureSc
     x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
     drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
     panel.contour(x, y, excess, levels=_SIGMAS, colors="white", linewidths=0.7)
-    panel.figure.colorbar(drawn, ax=panel, label=_NAME)
+    panel.figure.colorbar(drawn, ax=panel, label=_NAME, location="bottom")
     panel.contour(x, y, excess, levels=[np.sqrt(_CHI2_95)], colors=ORANGE, linewidths=2.0)
     panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % region by the cost")
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
@@ -254,8 +245,9 @@ def plot_convergence(
     starts = int(np.clip(np.sqrt(_ROWS / flat.count), *_STARTS)) if starts is None else starts
     x, y, points = plane(corners, starts, scene.fixes[0])
     places, _ = placed_points(flat, points)
-    figure = figure_class()(figsize=(13.0, 5.2), layout="constrained")
-    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    figure = figure_class()(figsize=(WIDE, 9.4), layout="constrained")
+    *panels, empty = figure.subplots(2, 2, sharex=True, sharey=True).ravel().tolist()
+    empty.set_axis_off()
     unit, size = unit_of(corners)
     for panel, method in zip(panels, _NAMES, strict=False):
         found = basins(flat, answer, places.reshape(starts, starts, -1), method)
@@ -266,7 +258,7 @@ def plot_convergence(
     draw_lines(panels[2], lines_of_position(flat, answer, x, y, places), np.zeros(2), size)
     for panel in panels:
         _draw_marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
-    _add_legend(figure, panels[2])
+    _add_legend(empty, panels[2])
     finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
     _draw_inset(panels[2], scene)
     separate_notes(figure)
@@ -292,8 +284,8 @@ def _draw_inset(panel: Axes, scene: PictureScene) -> None:
         yticks=[],
         aspect="equal",
     )
-    near.set_title("around the fix", fontsize=8, pad=3)
-    style.scale_bar(near, unit)
+    near.set_title("around the fix", fontsize=SMALL, pad=3)
+    scale_bar(near, unit)
 
 
 def verdict(fix: Fix) -> str:
@@ -335,8 +327,8 @@ def _draw_marks(panel: Axes, scene: PictureScene, size: float, corners: Array, u
     panel.label_outer()
 
 
-def _add_legend(figure: Figure, panel: Axes) -> None:
-    """Add a legend below the panels: the colours of the results, and the labels of `panel`."""
+def _add_legend(empty: Axes, panel: Axes) -> None:
+    """Add a legend in an empty panel: the colours of the results, and the labels of `panel`."""
     from matplotlib.patches import Patch
 
     patches = [Patch(facecolor=_COLOURS[end], label=f"a start here leads to {_ENDS[end]}") for end in End]
@@ -345,4 +337,4 @@ def _add_legend(figure: Figure, panel: Axes) -> None:
     kept = dict(zip(labels, handles, strict=True))
     shown = [*patches, *kept.values()]
     names = [*(str(patch.get_label()) for patch in patches), *kept]
-    figure.legend(shown, names, loc="outside lower center", ncols=3, frameon=False)
+    empty.legend(shown, names, loc="center", frameon=False)

@@ -16,7 +16,7 @@ from optloc.models import MODELS
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-from optloc.show.pictures.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid, literal
+from optloc.show.pictures.style import BLACK, BLUE, GREY, ORANGE, SKY, SMALL, figure_class, finish, grid, literal
 from optloc.station_health.stations import Health
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _draw(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
     figure, panels = _rows_of_panels([len(one) for one in sets], 7.6, 0.3)
     for panel, kind, one in zip(panels, kinds, sets, strict=True):
         _panel(panel, kind, one)
-    return finish(figure, title, panels, 4, fontsize=8)
+    return finish(figure, title, panels, 4, fontsize=SMALL)
 
 
 def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[Figure, Any]:
@@ -209,7 +209,7 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
     figure, panels = _rows_of_panels([len(groups) for groups in chosen], 8.0, 0.27)
     for panel, unit, groups in zip(panels, units, chosen, strict=True):
         _health_panel(panel, health, unit, groups)
-    return finish(figure, title, panels[:1], 4, fontsize=8)
+    return finish(figure, title, panels[:1], 4, fontsize=SMALL)
 
 
 def _groups_to_draw(health: Health, unit: str) -> Array:
@@ -249,7 +249,7 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     panel.grid(axis="x", color=GREY, alpha=0.3, linewidth=0.6)
     words = [f"{health.outliers[g]:.1%} of {health.count[g]}" for g in groups]
     right_axis = panel.secondary_yaxis("right")
-    right_axis.set_yticks(place, words, fontsize=8)
+    right_axis.set_yticks(place, words, fontsize=SMALL)
     right_axis.tick_params(length=0)
     right_axis.set_ylabel("outliers")
 
@@ -277,4 +277,4 @@ def _set_limits(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
             words, side, align = f"{bias[place]:.3g} {unit} \N{RIGHTWARDS ARROW}", reach, "right"
         else:
             words, side, align = f"\N{LEFTWARDS ARROW} {bias[place]:.3g} {unit}", -reach, "left"
-        panel.text(0.99 * side, place, words, ha=align, va="center", fontsize=8, color=ORANGE)
+        panel.text(0.99 * side, place, words, ha=align, va="center", fontsize=SMALL, color=ORANGE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from optloc.show.pictures.style import (
     ORANGE,
     PURPLE,
     SKY,
+    SMALL,
     YELLOW,
     figure_class,
     finish,
@@ -26,6 +27,7 @@ from optloc.show.pictures.style import (
     literal,
     panels_for,
 )
+from optloc.show.pictures.time_axes import TimeScale, time_scale
 from optloc.solvers.running import GrowingRun
 
 if TYPE_CHECKING:
@@ -147,34 +149,42 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     """
     word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
     sigma, entries = course.sigma(slot.name), slot.entries
+    scale = time_scale(course.times)
+    times = scale.values(course.times)
     if slot.members and slot.size > _MANY:
         # `total` is the root of the sum of squares of all members.
         entries, sigma = ("root mean square",), course.total(slot.name)[:, None] / np.sqrt(slot.size)
     for entry, values, colour in zip(entries, sigma.T, _COURSE_COLOURS * 2, strict=False):
         label = f"{word} {entry}".strip() if slot.members else f"along {entry}"
-        panel.plot(
-            course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=literal(label), zorder=3
-        )
+        panel.plot(times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=literal(label), zorder=3)
     if not slot.members:
-        panel.plot(course.times, course.total(slot.name), color=BLUE, linewidth=3.5, label=f"in {_SPACE[slot.size]}")
+        panel.plot(times, course.total(slot.name), color=BLUE, linewidth=3.5, label=f"in {_SPACE[slot.size]}")
         if known is not None:
             total = known.total(slot.name)
-            panel.plot(known.times, total, color=BLUE, linewidth=1.6, linestyle="--", label="the same, biases known")
+            dashed: dict[str, Any] = {"color": BLUE, "linewidth": 1.6, "linestyle": "--"}
+            panel.plot(scale.values(known.times), total, label="the same, biases known", **dashed)
     panel.set_yscale("log")
-    panel.set_xlabel("time (s)")
+    scale.name(panel)
     panel.set_ylabel(f"bound of the standard deviation ({unit})")
     panel.set_title(literal(slot.name))
     panel.grid(which="both", color=GREY, alpha=0.3, linewidth=0.6)
-    panel.legend(frameon=False, fontsize=8)
+    panel.legend(frameon=False, fontsize=SMALL)
 
 
 # Estimates of a run against time, with their intervals: biases and other unknowns that the epochs share.
 
 
 def plot_biases(
-    found: GrowingRun, title: str = "", *, names: Sequence[str] | None = None, truth: Mapping[str, Array] | None = None
+    found: GrowingRun,
+    title: str = "",
+    *,
+    names: Sequence[str] | None = None,
+    truth: Mapping[str, Array] | None = None,
+    units: Mapping[str, tuple[str, float]] | None = None,
 ) -> Figure:
     """Return a picture of estimates against the length of a run, with 95 % intervals, one panel for each family.
+
+    The legend has the final estimates with their standard deviations.
 
     Parameters
     ----------
@@ -185,7 +195,10 @@ def plot_biases(
     names : sequence of str, optional
         Names of the unknowns to draw; by default all families of biases.
     truth : mapping of str to array, optional
-        True values by name, drawn dotted.
+        True values by name, in SI units, drawn dotted.
+    units : mapping of str to (str, float), optional
+        Unit of a family by its name, and its size in SI units with sign; see `optloc.files.Loaded.bias_units`. Other
+        families are in SI units.
 
     Returns
     -------
@@ -203,33 +216,64 @@ def plot_biases(
         raise InvalidProblem("the run has no biases to draw", "names", advice)
     figure, panels = panels_for(len(slots), 2, 5.4, 4.0)
     for panel, slot in zip(panels, slots, strict=True):
-        _bias_panel(panel, found, slot, None if truth is None else truth.get(slot.name))
+        unit, size = (units or {}).get(slot.name, (slot.unit, 1.0))
+        values, sigma = found.take(slot.name)
+        estimates = _Estimates(values / size, sigma / abs(size), unit, slot)
+        true = None if truth is None or slot.name not in truth else np.ravel(truth[slot.name]) / size
+        _bias_panel(panel, found.times, estimates, true)
     return finish(figure, title)
 
 
-def _bias_panel(panel: Axes, found: GrowingRun, slot: Slot, truth: Array | None) -> None:
+class _Estimates(NamedTuple):
+    """Estimates of a family in the unit of its panel.
+
+    - values, sigma (k, p): p estimates after each of k epochs, and their standard deviations.
+    - unit: unit of the panel; empty for pure numbers.
+    - slot: place of the family in the vector of unknowns.
+    """
+
+    values: Array
+    sigma: Array
+    unit: str
+    slot: Slot
+
+
+def _bias_panel(panel: Axes, times: Array, found: _Estimates, truth: Array | None) -> None:
     """Draw the estimates of one family against time with their 95 % intervals.
 
-    If `truth` is given, the true values are drawn as dotted lines. `found` are the estimates, and `slot` is the place
-    of the family in the vector of unknowns.
+    `times` (k,) are in s. If `truth` (p,) is given, in the unit of the panel, the true values are dotted lines.
     """
-    values, sigma = found.take(slot.name)
+    values, sigma, unit, slot = found
+    scale: TimeScale = time_scale(times)
+    shown = scale.values(times)
     for i, entry in enumerate(slot.entries[:_MOST]):
         colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]
         style: dict[str, Any] = {"color": colour, "linewidth": 1.5, "linestyle": _DASHES[i % len(_DASHES)]}
-        panel.plot(found.times, values[:, i], label=literal(str(entry)), zorder=3, **style)
-        panel.fill_between(
-            found.times, values[:, i] - band, values[:, i] + band, color=colour, alpha=0.18, linewidth=0.0
-        )
+        label = f"{entry}: {_final_value(values[:, i], sigma[:, i], unit)}"
+        panel.plot(shown, values[:, i], label=literal(label), zorder=3, **style)
+        panel.fill_between(shown, values[:, i] - band, values[:, i] + band, color=colour, alpha=0.18, linewidth=0.0)
         if truth is not None:
-            panel.axhline(np.ravel(truth)[i], color=BLACK, linewidth=1.0, linestyle=":", zorder=2)
+            panel.axhline(truth[i], color=BLACK, linewidth=1.0, linestyle=":", zorder=2)
     _limit_to_estimates(panel, values[:, :_MOST], sigma[:, :_MOST])
     hidden = len(slot.entries) - _MOST
     panel.set_title(literal(slot.name) + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
-    panel.set_xlabel("time (s)")
-    panel.set_ylabel(f"estimate with 95 % interval ({slot.unit})" if slot.unit else "estimate with 95 % interval")
-    panel.legend(frameon=False, fontsize=8, ncols=2)
+    scale.name(panel)
+    panel.set_ylabel(f"estimate with 95 % interval ({unit})" if unit else "estimate with 95 % interval")
+    # Estimates settle in the middle of the panel, so the legend is below it.
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2}
+    panel.legend(frameon=False, fontsize=SMALL, title="final value ± sigma", title_fontsize=SMALL, **place)
     grid(panel)
+
+
+def _final_value(values: Array, sigma: Array, unit: str) -> str:
+    """Return the last known estimate with its standard deviation and unit as text; "unknown" without an estimate."""
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(sigma))
+    if not len(known):
+        return "unknown"
+    value, error = float(values[known[-1]]), float(sigma[known[-1]])
+    # Two digits of the standard deviation, and the same decimals of the value.
+    digits = 0 if error <= 0.0 else max(0, 1 - int(np.floor(np.log10(error))))
+    return f"{value:.{digits}f} ± {error:.{digits}f} {unit}".strip()
 
 
 def _limit_to_estimates(panel: Axes, values: Array, sigma: Array) -> None:

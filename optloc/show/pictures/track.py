@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.problem.problem import Problem
+from optloc.show.pictures.notes import separate_notes
 from optloc.show.pictures.style import (
     BLACK,
     BLUE,
@@ -19,13 +20,18 @@ from optloc.show.pictures.style import (
     ORANGE,
     PURPLE,
     SKY,
+    SMALL,
+    WIDE,
     YELLOW,
     ellipse_line,
     figure_class,
     finish,
+    grid,
     literal,
+    note,
     unit_of,
 )
+from optloc.show.pictures.time_axes import TimeScale, time_scale
 from optloc.tracking.entry import Entry
 
 if TYPE_CHECKING:
@@ -33,6 +39,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CYCLE = (BLUE, GREEN, PURPLE, SKY, YELLOW)
+# Maximum number of stations with names: more names would overlap.
+_NAMED = 20
 # Maximum number of ellipses along a track: more would merge to a band.
 _ELLIPSES = 25
 # A station is left out if its distance from the tracks is more than this many extents of the tracks, as for satellites.
@@ -63,7 +71,7 @@ class PlottedTrack:
 
 
 @dataclass(frozen=True, slots=True)
-class _Line:
+class TrackLine:
     """A track as arrays over its k scans, along the axes of the picture.
 
     - name: name of the target.
@@ -105,31 +113,45 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
     """
     lines, stations, axes = _along_picture_axes(drawn)
     names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]
-    figure = figure_class()(figsize=(12.5, 2.4 + 2.2 * len(names)), layout="constrained")
+    figure = figure_class()(figsize=(WIDE, 2.4 + 2.2 * len(names)), layout="constrained")
     panels = figure.subplot_mosaic([["plan", name] for name in names])
-    _draw_plan(panels["plan"], lines, stations, axes)
+    scale = time_scale(np.concatenate([line.times for line in lines]))
+    draw_plan(panels["plan"], lines, stations, axes, drawn[0].problem.stations.names)
     if "height" in panels:
-        _draw_heights(panels["height"], lines, axes[2])
-    _draw_sigmas(panels["sigma"], lines)
-    _draw_innovations(panels["nis"], lines)
+        draw_heights(panels["height"], lines, axes[2], scale)
+    draw_sigmas(panels["sigma"], lines, scale)
+    draw_innovations(panels["nis"], lines, scale)
     for name in names:
-        panels[name].grid(color=GREY, alpha=0.35, linewidth=0.6)
-        panels[name].sharex(panels[names[-1]]) if name != names[-1] else panels[name].set_xlabel("time (s)")
-    return finish(figure, title, [panels["plan"]], 6)
+        grid(panels[name])
+        if name != names[-1]:
+            panels[name].sharex(panels[names[-1]])
+            panels[name].tick_params(labelbottom=False)
+            panels[name].xaxis.offsetText.set_visible(False)
+    scale.name(panels[names[-1]])
+    finish(figure, title, [panels["plan"]], 6)
+    separate_notes(figure)
+    return figure
 
 
-def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Array, tuple[str, ...]]:
+def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[TrackLine], Array, tuple[str, ...]]:
     """Return tracks and stations (s, d) of the first scan along the axes of the picture, and the names of the axes.
 
     `drawn` are at least one track; the first track gives the stations and the frame.
     """
     first = drawn[0].problem
+    return turned([_track_arrays(each, first.dimension) for each in drawn], first)
+
+
+def turned(lines: Sequence[TrackLine], first: Problem) -> tuple[list[TrackLine], Array, tuple[str, ...]]:
+    """Return tracks and stations (s, d) along the axes of the picture, and the names of the axes.
+
+    The problem `first` has the stations and the frame of the tracks.
+    """
     d = first.dimension
     stations = first.stations.position.reshape(-1, first.stations.count, d)[0]
-    lines = [_track_arrays(each, d) for each in drawn]
     axes = ("east", "north", "up") if first.frame.geodetic else ("x", "y", "z")
     if first.frame.kind != "ecef":
-        return lines, stations, axes[:d]
+        return list(lines), stations, axes[:d]
     known = [line.position[np.isfinite(line.position).all(-1)] for line in lines]
     # The origin is the first position, because stations can be satellites far above the ground.
     lat, lon, height = first.frame.to_geodetic(next((p[0] for p in known if len(p)), stations.mean(0)))
@@ -139,11 +161,11 @@ def _along_picture_axes(drawn: Sequence[PlottedTrack]) -> tuple[list[_Line], Arr
     return moved, local.from_ecef(stations), axes
 
 
-def _track_arrays(drawn: PlottedTrack, d: int) -> _Line:
+def _track_arrays(drawn: PlottedTrack, d: int) -> TrackLine:
     """Return a track as arrays in the frame of its problem; `d` is the number of coordinates."""
     entries = drawn.entries
     cov = np.stack([e.updated.cov[:d, :d] for e in entries])
-    return _Line(
+    return TrackLine(
         drawn.name,
         np.array([e.time for e in entries]),
         np.stack([e.updated.mean[:d] for e in entries]),
@@ -156,24 +178,30 @@ def _track_arrays(drawn: PlottedTrack, d: int) -> _Line:
     )
 
 
-def _with_colours(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
+def _with_colours(lines: Sequence[TrackLine]) -> list[tuple[TrackLine, str]]:
     """Return each track with its colour; colours repeat after five tracks."""
     return [(line, _CYCLE[i % len(_CYCLE)]) for i, line in enumerate(lines)]
 
 
-def _draw_plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[str]) -> None:
+def draw_plan(
+    panel: Axes, lines: Sequence[TrackLine], stations: Array, axes: Sequence[str], names: Sequence[str] = ()
+) -> None:
     """Draw the plan: stations near the tracks, tracks with their starts and their bad scans, and ellipses.
 
-    `lines` are the tracks, and `axes` the names of the axes.
+    `lines` are the tracks, `axes` the names of the axes, and `names` the names of the stations.
     """
     position = np.concatenate([line.position for line in lines])[:, :2]
     known = position[np.isfinite(position).all(-1)]
-    spots = stations[_is_near(stations[:, :2], known), :2]
+    near = _is_near(stations[:, :2], known)
+    spots = stations[near, :2]
     unit, size = unit_of(np.concatenate([spots, known]))
     if len(spots):
         panel.scatter(
             spots[:, 0] / size, spots[:, 1] / size, marker="^", s=50, color=BLACK, label="station, first scan", zorder=3
         )
+    if len(spots) <= _NAMED:
+        for i in np.flatnonzero(near)[: len(names)].tolist():
+            note(panel, names[i], *(stations[i, :2] / size).tolist())
     for i, (line, colour) in enumerate(_with_colours(lines)):
         path = line.position[:, :2] / size
         panel.plot(
@@ -190,7 +218,7 @@ def _draw_plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Seque
     panel.set_xlabel(f"{axes[0]} ({unit})")
     panel.set_ylabel(f"{axes[1]} ({unit})")
     panel.set_title("plan")
-    panel.grid(color=GREY, alpha=0.35, linewidth=0.6)
+    grid(panel)
 
 
 def _is_near(stations: Array, known: Array) -> Array:
@@ -201,7 +229,7 @@ def _is_near(stations: Array, known: Array) -> Array:
     return np.asarray(np.linalg.norm(stations - centre, axis=-1) < _OUT * extent)
 
 
-def _draw_ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
+def _draw_ellipses(panel: Axes, line: TrackLine, size: float, label: str | None) -> None:
     """Draw the 95 % ellipses of some scans of a track in a plan with the unit `size`, m."""
     known = np.flatnonzero(np.isfinite(line.cov).all((-1, -2)))
     for i in known[:: max(1, len(known) // _ELLIPSES)]:
@@ -210,27 +238,30 @@ def _draw_ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> 
         label = None
 
 
-def _draw_heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
-    """Draw the height of each track against time with its 95 % interval; `name` is the name of the third axis."""
+def draw_heights(panel: Axes, lines: Sequence[TrackLine], name: str, scale: TimeScale) -> None:
+    """Draw the height of each track against time with its 95 % interval.
+
+    `name` is the name of the third axis, and `scale` converts the times.
+    """
     for line, colour in _with_colours(lines):
         sigma = np.sqrt(line.cov[:, 2, 2])
-        panel.plot(line.times, line.position[:, 2], color=colour, linewidth=1.2)
+        panel.plot(scale.values(line.times), line.position[:, 2], color=colour, linewidth=1.2)
         band = (line.position[:, 2] - _95 * sigma, line.position[:, 2] + _95 * sigma)
-        panel.fill_between(line.times, *band, color=colour, alpha=0.2, linewidth=0.0)
+        panel.fill_between(scale.values(line.times), *band, color=colour, alpha=0.2, linewidth=0.0)
     panel.set_ylabel(f"{name} (m)")
     panel.set_title("height, with 95 % interval")
 
 
-def _draw_sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
+def draw_sigmas(panel: Axes, lines: Sequence[TrackLine], scale: TimeScale) -> None:
     """Draw the standard deviation of the position of each track, all axes together, against time."""
     for line, colour in _with_colours(lines):
-        panel.plot(line.times, line.sigma, color=colour, linewidth=1.2)
+        panel.plot(scale.values(line.times), line.sigma, color=colour, linewidth=1.2)
     _use_log_axis(panel, np.concatenate([line.sigma for line in lines]))
     panel.set_ylabel("sigma (m)")
-    panel.set_title("standard deviation of the position, all axes together")
+    panel.set_title("sigma of the position, all axes together")
 
 
-def _draw_innovations(panel: Axes, lines: Sequence[_Line]) -> None:
+def draw_innovations(panel: Axes, lines: Sequence[TrackLine], scale: TimeScale) -> None:
     """Draw the NIS, and the 99.9 % quantile of chi-square for the number of rows of each scan.
 
     `lines` are the tracks; scans without a test have no point and no line.
@@ -240,14 +271,16 @@ def _draw_innovations(panel: Axes, lines: Sequence[_Line]) -> None:
     # The NIS of m rows is chi-square with m degrees of freedom, so the line depends on the number of rows of each scan.
     for i, (line, colour) in enumerate(_with_colours(lines)):
         tested = np.isfinite(line.nis) & (line.count > 0)
-        panel.plot(line.times[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4)
+        panel.plot(
+            scale.values(line.times)[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4
+        )
         limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), _ALLOWED)
         label = None if i else "99.9 % of the chi-square"
-        panel.plot(line.times, np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
+        panel.plot(scale.values(line.times), np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
     _use_log_axis(panel, np.concatenate([line.nis for line in lines]))
     panel.set_ylabel("NIS")
-    panel.set_title("normalised innovation squared of each scan")
-    panel.legend(frameon=False, fontsize=8, loc="lower right")
+    panel.set_title("normalised innovation squared (NIS)")
+    panel.legend(frameon=False, fontsize=SMALL, loc="lower right")
 
 
 def _use_log_axis(panel: Axes, values: Array) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from optloc.problem import (
     NoSolution,
     Status,
     no_station,
+    plot_of,
     tail_probability,
 )
 from optloc.sites.calibration.blocks import StationBlock, blocks, moved_pulses, place_pulses
@@ -43,6 +45,9 @@ from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, NetworkF
 from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.restarts import laid
 from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, objections
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Pulses in the search, those with the most rows: more pulses did not find other networks.
 _CORE = 60
@@ -146,6 +151,10 @@ class Calibration(HasShortForm):
     alternatives: tuple[Alternative, ...]
     residuals: Array
     left_out: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+
+    def plot(self, **options: Any) -> Axes:
+        """Return a plan in matplotlib axes; see `optloc.sites.calibration_axes` for the options."""
+        return plot_of(self, **options)
 
     @property
     def sigma(self) -> Array:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.problem import Array
-from optloc.show import BLACK, GREY, figure_class, literal
+from optloc.show import BLACK, BLUE, GREY, ORANGE, SMALL, WIDE, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,15 +63,15 @@ def plot_network(
         Title of the figure.
     """
     d = stations.shape[1]
-    figure = figure_class()(figsize=(9.6, 4.8 if d == 2 else 6.4), layout="constrained")
+    figure = figure_class()(figsize=(WIDE, 4.8 if d == 2 else 6.4), layout="constrained")
     figure.suptitle(literal(title))
     grid = figure.add_gridspec(d - 1, 2, width_ratios=[2.0, 1.0], height_ratios=[2.0, 1.0][: d - 1])
     views = [(0, 1)] if d == 2 else [(0, 1), (0, 2)]
     for row, view in enumerate(views):
         axes = figure.add_subplot(grid[row, 0])
-        _draw_plane(axes, view, names, stations, covariance, pulses, known, others)
+        draw_network(axes, view, names, stations, covariance, pulses, known, others)
         if row == 0:
-            axes.legend(fontsize="small", loc="best")
+            axes.legend(fontsize=SMALL, loc="best")
     _histogram(figure.add_subplot(grid[:, 1]), residuals[np.isfinite(residuals)], dof)
     return figure
 
@@ -89,14 +89,14 @@ def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
         x = np.linspace(-_FAR, _FAR, 200)
         law = np.exp(-0.5 * (x / spread) ** 2) / (np.sqrt(2.0 * np.pi) * spread)
         axes.plot(x, law, color=BLACK, label=f"expected, {dof} degrees of freedom")
-        axes.legend(fontsize="small", loc="upper right")
+        axes.legend(fontsize=SMALL, loc="upper right")
         axes.margins(y=0.2)
     beyond = int((np.abs(residuals) > _FAR).sum())
     title = "residuals" + (f"; {beyond} beyond {_FAR:g} in the last bars" if beyond else "")
-    axes.set(xlabel="residual, standard deviations", ylabel="density", title=title)
+    axes.set(xlabel="residual (standard deviations)", ylabel="density", title=title)
 
 
-def _draw_plane(
+def draw_network(
     axes: Axes,
     view: tuple[int, int],
     names: Sequence[str],
@@ -112,14 +112,14 @@ def _draw_plane(
     """
     i, k = view
     d = stations.shape[1]
-    axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")
+    axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses" if len(pulses) else None)
     for place, other in ((s, o) for one in others for s, o in zip(stations, one, strict=True)):
         axes.plot([place[i], other[i]], [place[k], other[k]], "-", color=GREY, linewidth=0.6)
     for n, one in enumerate(others):
         label = "other networks that fit" if n == 0 else None
         axes.plot(one[:, i], one[:, k], "o", markerfacecolor="none", color=GREY, label=label)
-    axes.plot(known[:, i], known[:, k], "x", color="tab:orange", label="known" if np.isfinite(known).any() else None)
-    axes.plot(stations[:, i], stations[:, k], "^", color="tab:blue", label="stations, 95 %")
+    axes.plot(known[:, i], known[:, k], "x", color=ORANGE, label="known" if np.isfinite(known).any() else None)
+    axes.plot(stations[:, i], stations[:, k], "^", color=BLUE, label="stations, 95 %")
     turn = np.linspace(0.0, 2.0 * np.pi, _POINTS)
     circle = _RADIUS * np.array([np.cos(turn), np.sin(turn)])
     for n, name in enumerate(names):
@@ -127,7 +127,9 @@ def _draw_plane(
         if np.isfinite(block).all():
             width, turned = np.linalg.eigh(block)
             shape = turned @ (np.sqrt(np.maximum(width, 0.0))[:, None] * circle)
-            axes.plot(stations[n, i] + shape[0], stations[n, k] + shape[1], color="tab:blue", linewidth=0.8)
-        axes.annotate(literal(name), (stations[n, i], stations[n, k]), xytext=(4, 4), textcoords="offset points")
+            axes.plot(stations[n, i] + shape[0], stations[n, k] + shape[1], color=BLUE, linewidth=0.8)
+        axes.annotate(
+            literal(name), (stations[n, i], stations[n, k]), xytext=(5, 5), textcoords="offset points", fontsize=SMALL
+        )
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel=f"{'xyz'[i]}, m", ylabel=f"{'xyz'[k]}, m")
+    axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[k]} (m)")

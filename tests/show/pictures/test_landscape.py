@@ -8,7 +8,7 @@ from show.ranging import PLACES, TRUTH, ranged
 
 from optloc import InvalidProblem
 from optloc.show.pictures.landscape import _excess, limits, plane, single
-from optloc.show.pictures.style import scene_of
+from optloc.show.pictures.scene import scene_of
 
 
 def test_a_square_holds_stations_and_fix_with_a_rim():

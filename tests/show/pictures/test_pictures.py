@@ -7,6 +7,7 @@ from importlib.resources import files as package_files
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from often import few
 from typer.testing import CliRunner
 
@@ -17,7 +18,7 @@ from optloc.cli import app
 from optloc.kernels.sums import equations_at
 from optloc.show import pictures as plot
 from optloc.show.pictures.landscape import limits, plane
-from optloc.show.pictures.style import scene_of
+from optloc.show.pictures.scene import scene_of
 from optloc.solvers.landscape import End, basins, profile_cost
 from optloc.solvers.running import growing
 
@@ -77,6 +78,9 @@ def test_a_picture_is_whole(name, tmp_path):
         if axes.axison and axes.get_ylabel():
             assert axes.get_ylabel().endswith(")"), axes.get_ylabel()
     assert any(axes.get_xlabel() for axes in figure.axes)
+    # 700 pixels are the width of a page, and 9 pixels the smallest text
+    sizes = [text.get_fontsize() for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+    assert min(sizes) * 700.0 / (72.0 * figure.get_figwidth()) >= 9.0
     assert not list(overlapping(figure))
 
 

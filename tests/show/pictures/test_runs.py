@@ -40,3 +40,18 @@ def test_a_run_without_biases_has_no_picture_of_them():
     with pytest.raises(InvalidProblem, match="no biases to draw") as refused:
         plot_biases(found)
     assert refused.value.advice == "choose from position"
+
+
+def test_biases_are_in_the_unit_of_the_file_with_their_final_value():
+    slot = SimpleNamespace(name="clock", members=("R2",), entries=("R2",), unit="m")
+    sigma = np.array([[9.0], [0.6], [np.nan]])
+    values = np.array([[3.0], [30.0], [np.nan]])
+    layout = SimpleNamespace(shared=(slot,))
+    found = SimpleNamespace(layout=layout, times=np.arange(3.0), take=lambda name: (values, sigma))
+    (panel,) = plot_biases(found, units={"clock": ("ns", 0.3)}, truth={"clock": np.array([27.0])}).axes
+    assert panel.get_ylabel() == "estimate with 95 % interval (ns)"
+    assert panel.get_legend().get_texts()[0].get_text() == "R2: 100.0 ± 2.0 ns"
+    assert panel.lines[0].get_ydata()[:2] == pytest.approx([10.0, 100.0])
+    assert panel.lines[1].get_ydata() == pytest.approx([90.0, 90.0])
+    (plain,) = plot_biases(found).axes
+    assert plain.get_legend().get_texts()[0].get_text() == "R2: 30.00 ± 0.60 m"

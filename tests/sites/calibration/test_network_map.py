@@ -20,7 +20,7 @@ def drawn(d, others=(), residuals=(0.0,)):
 def test_a_network_in_space_has_an_elevation_as_well():
     labels = [[(axes.get_xlabel(), axes.get_ylabel()) for axes in drawn(d).axes] for d in (2, 3)]
     assert [len(views) for views in labels] == [2, 3]
-    assert labels[1][:2] == [("x, m", "y, m"), ("x, m", "z, m")]
+    assert labels[1][:2] == [("x (m)", "y (m)"), ("x (m)", "z (m)")]
 
 
 def test_ellipses_hold_95_per_cent():

@@ -1,4 +1,4 @@
-"""The map of a placement: two panels on one scale, stations that are taken, and the course of the search."""
+"""The map of a placement: two panels on one scale, stations that are taken, and the loss of each station."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ pytest.importorskip("matplotlib", reason="pictures need matplotlib")
 
 from optloc.bounds import BoundMap
 from optloc.sites.placement import placement_map
-from optloc.sites.placement.placement_map import plot_placement
+from optloc.sites.placement.placement_map import Loss, plot_placement
 
 
 def maps(side):
@@ -31,8 +31,9 @@ def drawn(monkeypatch):
 
 def draw(side):
     taken = np.array([[True, True, False], [True, True, True]])
-    course = np.array([[10.0, 1.0, 3.0], [12.0, 2.0, 2.0]])
-    return plot_placement(maps(side), taken, np.array([[0.5, 0.5]]) * side, np.ones(1), course, ("before", "after"))
+    losses = [Loss("A", np.inf, "", np.inf), Loss("C", 5.0, "D", 3.0)]
+    places = np.array([[0.5, 0.5]]) * side
+    return plot_placement(maps(side), taken, places, np.ones(1), losses, 2.0, ("before", "after"))
 
 
 def test_both_maps_have_one_scale_and_show_who_is_taken(drawn):
@@ -51,8 +52,16 @@ def test_a_large_map_is_in_kilometres(drawn, side, unit, width):
     assert axes.get_xlim() == pytest.approx((0.0, width))
 
 
-def test_the_course_begins_with_the_first_bound(drawn):
-    course = next(axes for axes in drawn(100.0).axes if axes.get_ylabel() == "criterion (m)")
-    value, bound = course.get_lines()
-    assert value.get_xydata().tolist() == [[0.0, 3.0], [2.0, 2.0]]
-    assert bound.get_ydata().tolist() == [1.0, 2.0]
+def test_candidates_have_a_dark_outline(drawn):
+    (candidates,) = [one for one in drawn(100.0).axes[0].collections if one.get_label() == "candidate, not taken"]
+    assert candidates.get_edgecolor().tolist() == [[0.0, 0.0, 0.0, 1.0]]
+
+
+def test_each_loss_is_a_bar_with_its_replacement(drawn):
+    panel = next(axes for axes in drawn(100.0).axes if axes.get_title() == "loss of one station")
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["A", "C"]
+    assert panel.patches[1].get_width() == 5.0
+    assert [text.get_text() for text in panel.texts] == ["no fix"]
+    (replaced,) = panel.collections
+    assert replaced.get_offsets()[1].tolist() == [3.0, 1.0]
+    assert panel.lines[0].get_xdata()[0] == 2.0
