@@ -36,7 +36,8 @@ SEEN = """(least => {
     if (Math.round(height / parseFloat(style.lineHeight)) > text.split('\\n').length) found.broken.push(text);
     const width = pre.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight);
     pen.font = style.font;
-    found.tables.push(...text.split('\\n').filter(line => /[│━]/.test(line) && pen.measureText(line).width > width + 1));
+    const wide = line => /[│━]/.test(line) && pen.measureText(line).width > width + 1;
+    found.tables.push(...text.split('\\n').filter(wide));
   }
   const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   while (texts.nextNode()) {
