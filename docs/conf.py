@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
+    "sphinx_design",  # cards of the front page
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # MathJax and its fonts lie beside the pages
 ]

@@ -59,7 +59,7 @@ def blocks(page):
 
 def commands(block):
     """Return pairs of a command and the output that is shown of it, None where there is none."""
-    lines = block.text.replace("\\\n", " ").splitlines()
+    lines = re.split(r"(?<!\\)\n", block.text)  # a backslash continues a command on the next line
     if not any(line.startswith("$ ") for line in lines):
         return [(line.split("  #")[0].strip(), None) for line in lines if line.strip() and not line.startswith("#")]
     pairs = []
@@ -82,7 +82,7 @@ def run_python(block, names, page):
 
 def run_command(command):
     """Run a command line of optloc; return what it prints and its exit code."""
-    words = shlex.split(command)
+    words = shlex.split(command.replace("\\\n", " "))
     assert words[0] == "optloc", f"{command}: only optloc runs here; mark the block"
     result = CliRunner().invoke(app, words[1:])
     assert result.exception is None or isinstance(result.exception, SystemExit), (command, result.exception)

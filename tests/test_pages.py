@@ -1,4 +1,4 @@
-"""The pages of the documentation as they are built: they ask nobody for anything, draw all formulas, and fit a phone.
+"""The pages of the documentation as they are built: they ask nobody for anything, draw all formulas, and are readable.
 
 Without OPTLOC_PAGES, the folder of built pages, a few of them are built here.
 """
@@ -18,9 +18,35 @@ from show.browser import Browser, executable
 
 # Links that a reader follows are no requests; everything that a browser fetches by itself is.
 FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "embed": "src"}
-NEEDED = ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_gallery", "sphinx-mathjax-offline")
+NEEDED = ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_design", "sphinx_gallery", "sphinx-mathjax-offline")
 FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md")
-PHONE = 390
+PHONE, DESK = 390, 1280
+# The least size of text that can be read, in pixels.
+LEAST = 9
+CORE = re.search(r":caption: Core\n:hidden:\n\n(.*?)```", (DOCS / "index.md").read_text("utf-8"), re.DOTALL)[1]
+# What a reader sees badly: the reach of the page, blocks of code that go on beyond their edge, blocks with more lines
+# than were written, tables in blocks that are wider than these, and text below a size.
+SEEN = """(least => {
+  const found = {wide: document.documentElement.scrollWidth, hidden: [], broken: [], tables: [], small: []};
+  const pen = document.createElement('canvas').getContext('2d');
+  for (const pre of document.querySelectorAll('article pre')) {
+    const style = getComputedStyle(pre), text = pre.textContent.trimEnd();
+    if (pre.scrollWidth > pre.clientWidth) found.hidden.push(text);
+    const height = pre.clientHeight - parseFloat(style.paddingTop) - parseFloat(style.paddingBottom);
+    if (Math.round(height / parseFloat(style.lineHeight)) > text.split('\\n').length) found.broken.push(text);
+    const width = pre.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight);
+    pen.font = style.font;
+    const wide = line => /[│━]/.test(line) && pen.measureText(line).width > width + 1;
+    found.tables.push(...text.split('\\n').filter(wide));
+  }
+  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (texts.nextNode()) {
+    const {data, parentElement: place} = texts.currentNode;
+    const drawn = data.trim() && place.offsetParent && !place.closest('script, style');
+    if (drawn && parseFloat(getComputedStyle(place).fontSize) < least) found.small.push(data);
+  }
+  return found;
+})"""
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +60,13 @@ def pages(tmp_path_factory):
         place = folder / name
         place.parent.mkdir(exist_ok=True)
         (shutil.copytree if (DOCS / name).is_dir() else shutil.copy)(DOCS / name, place)
-    (folder / "index.md").write_text("# optloc\n\n```{toctree}\n" + "\n".join(n[:-3] for n in FEW) + "\n```\n")
+    (folder / "recipes").mkdir()
+    for picture in (DOCS / "recipes").glob("*.png"):
+        shutil.copy(picture, folder / "recipes")
+    front = re.sub(r"```\{toctree\}.*?```", "", (DOCS / "index.md").read_text("utf-8"), flags=re.DOTALL)
+    (folder / "index.md").write_text(f"{front}\n```{{toctree}}\n" + "\n".join(n[:-3] for n in FEW) + "\n```\n")
     # Without the gallery, whose examples run, and the sources of all modules.
-    settings = "extensions=myst_parser,sphinx.ext.mathjax,sphinx-mathjax-offline"
+    settings = "extensions=myst_parser,sphinx_design,sphinx.ext.mathjax,sphinx-mathjax-offline"
     command = [sys.executable, "-m", "sphinx", "-q", "-D", settings, str(folder), str(folder / "html")]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     return folder / "html"
@@ -118,3 +148,44 @@ def test_a_browser_draws_all_formulas_and_a_phone_shows_all_of_a_page(pages):
             wide += [f"{path.name}: {reach}"] if reach > PHONE else []
         assert {url.partition(":")[0] for url in browser.requests} == {"file"}
     assert wide == []
+
+
+def in_the_core(pages):
+    """Return the front page and the core pages, those that are built."""
+    names = ["index", *(line.rpartition("<")[2].rstrip(">") for line in CORE.split("\n") if line)]
+    return [path for name in names if (path := pages / f"{name}.html").exists()]
+
+
+@pytest.mark.skipif(executable() is None, reason="there is no browser")
+def test_code_and_text_of_core_pages_are_readable_on_a_desk_and_a_phone(pages, tmp_path):
+    wrong = []
+    with Browser() as browser:
+        for path in in_the_core(pages):
+            front = path.stem == "index"
+            for width in (DESK, PHONE):
+                browser.open(path, width, 900, phone=width == PHONE)
+                seen = browser.run(f"{SEEN}({LEAST})")
+                # On a phone code is moved within its block, but not on the front page.
+                bad = [*seen["small"], *(seen["hidden"] if front or width == DESK else [])]
+                # Long lines may break, but no line of a table, and none of the front page.
+                bad += (seen["broken"] if front else []) + (seen["tables"] if width == DESK else [])
+                wrong += [f"{path.name} at {width}: {text[:60]}" for text in bad]
+                wrong += [f"{path.name} at {width}: reaches to {seen['wide']}"] if seen["wide"] > width else []
+                if front:
+                    browser.picture(tmp_path / f"front-{width}.png", whole=True)
+    assert wrong == [], "\n".join(wrong)
+
+
+@pytest.mark.skipif(executable() is None, reason="there is no browser")
+def test_the_test_sees_what_cannot_be_read(tmp_path):
+    page, long = tmp_path / "page.html", "x" * 200
+    page.write_text(
+        "<article><style>pre { overflow: auto; line-height: 18px }</style>"
+        f"<pre>{long}</pre><pre style='white-space: pre-wrap; overflow-wrap: anywhere'>{long}</pre>"
+        f"<p style='font-size: 8px'>small</p><pre>short\nlines</pre><pre>│{long}</pre></article>"
+    )
+    with Browser() as browser:
+        browser.open(page, DESK, 900)
+        seen = browser.run(f"{SEEN}({LEAST})")
+    table = f"│{long}"
+    assert seen == {"wide": DESK, "hidden": [long, table], "broken": [long], "tables": [table], "small": ["small"]}
