@@ -18,8 +18,8 @@ from show.browser import Browser, executable
 
 # Links that a reader follows are no requests; everything that a browser fetches by itself is.
 FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "embed": "src"}
-NEEDED = ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_gallery", "sphinx-mathjax-offline")
-FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md")
+NEEDED = ("sphinx", "furo", "myst_nb", "numpydoc", "sphinx_gallery", "sphinx-mathjax-offline")
+FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md", "notebooks/first-fix.ipynb")
 PHONE = 390
 
 
@@ -34,9 +34,10 @@ def pages(tmp_path_factory):
         place = folder / name
         place.parent.mkdir(exist_ok=True)
         (shutil.copytree if (DOCS / name).is_dir() else shutil.copy)(DOCS / name, place)
-    (folder / "index.md").write_text("# optloc\n\n```{toctree}\n" + "\n".join(n[:-3] for n in FEW) + "\n```\n")
+    names = "\n".join(name.rpartition(".")[0] for name in FEW)
+    (folder / "index.md").write_text(f"# optloc\n\n```{{toctree}}\n{names}\n```\n")
     # Without the gallery, whose examples run, and the sources of all modules.
-    settings = "extensions=myst_parser,sphinx.ext.mathjax,sphinx-mathjax-offline"
+    settings = "extensions=myst_nb,sphinx.ext.mathjax,sphinx-mathjax-offline"
     command = [sys.executable, "-m", "sphinx", "-q", "-D", settings, str(folder), str(folder / "html")]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     return folder / "html"
