@@ -14,7 +14,7 @@ copyright = "2026, optloc contributors"
 release = version = installed_version("optloc")
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # pages and notebooks; it contains myst_parser
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
@@ -31,6 +31,8 @@ html_title = f"optloc {release}"
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
+nb_execution_mode = "off"  # the notebooks are stored with their outputs, and a test repeats them
+nb_ipywidgets_js = {}  # no notebook has widgets, whose scripts come from elsewhere
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"

@@ -38,9 +38,12 @@ HABITS = {
 
 
 def texts(path: Path) -> list[str]:
-    """Return the docstrings, comments and longer strings of a module, or the paragraphs of a page."""
+    """Return the docstrings, comments and longer strings of a module, or the paragraphs of a page or notebook."""
     source = path.read_text(encoding="utf-8")
-    if path.suffix == ".md":
+    if path.suffix == ".ipynb":
+        cells = json.loads(source)["cells"]
+        source = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    if path.suffix in (".md", ".ipynb"):
         prose = re.sub(r"```.*?```|^\|.*$", "", source, flags=re.DOTALL | re.MULTILINE)  # without code and tables
         return prose.split("\n\n")
     constants = [node for node in nodes(path) if isinstance(node, ast.Constant)]
@@ -58,6 +61,7 @@ def folder_of(path: Path) -> str:
 def pages_and_modules() -> list[Path]:
     """Return the paths of all modules and pages, without pages that tools generate."""
     paths = [*ROOT.glob("optloc/**/*.py"), *ROOT.glob("formulations/**/*.py"), *ROOT.glob("docs/**/*.md")]
+    paths += ROOT.glob("docs/notebooks/*.ipynb")
     return [path for path in [*paths, ROOT / "README.md"] if not {"_build", "gallery"} & set(path.parts)]
 
 

@@ -18,8 +18,8 @@ from show.browser import Browser, executable
 
 # Links that a reader follows are no requests; everything that a browser fetches by itself is.
 FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "embed": "src"}
-NEEDED = ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_design", "sphinx_gallery", "sphinx-mathjax-offline")
-FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md")
+NEEDED = ("sphinx", "furo", "myst_nb", "numpydoc", "sphinx_design", "sphinx_gallery", "sphinx-mathjax-offline")
+FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md", "notebooks/first-fix.ipynb")
 PHONE, DESK = 390, 1280
 # The least size of text that can be read, in pixels.
 LEAST = 9
@@ -64,9 +64,11 @@ def pages(tmp_path_factory):
     for picture in (DOCS / "recipes").glob("*.png"):
         shutil.copy(picture, folder / "recipes")
     front = re.sub(r"```\{toctree\}.*?```", "", (DOCS / "index.md").read_text("utf-8"), flags=re.DOTALL)
-    (folder / "index.md").write_text(f"{front}\n```{{toctree}}\n" + "\n".join(n[:-3] for n in FEW) + "\n```\n")
+    (folder / "index.md").write_text(
+        f"{front}\n```{{toctree}}\n" + "\n".join(name.rpartition(".")[0] for name in FEW) + "\n```\n"
+    )
     # Without the gallery, whose examples run, and the sources of all modules.
-    settings = "extensions=myst_parser,sphinx_design,sphinx.ext.mathjax,sphinx-mathjax-offline"
+    settings = "extensions=myst_nb,sphinx_design,sphinx.ext.mathjax,sphinx-mathjax-offline"
     command = [sys.executable, "-m", "sphinx", "-q", "-D", settings, str(folder), str(folder / "html")]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     return folder / "html"
