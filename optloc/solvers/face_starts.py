@@ -203,7 +203,7 @@ def _fitted(problem: Problem, x: Array, fixed: Array) -> Array:
     flat = np.where(np.isfinite(x), x, 0.0).reshape(n * k, -1)
     with np.errstate(all="ignore"):
         information, vector, _ = marginal(equations_at(problem.take(np.repeat(np.arange(n), k)), flat))
-    usable = np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1)
+    usable: Array = np.asarray(np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1))
     block = np.where(usable[:, None, None], information[:, free[:, None], free], np.eye(len(free)))
     step = (np.linalg.pinv(block, hermitian=True) @ np.where(usable[:, None], vector[:, free], 0.0)[..., None])[..., 0]
     out = x.copy()

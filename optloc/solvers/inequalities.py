@@ -65,7 +65,9 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
     x, cost, status = done.x, done.cost, done.status
     # other unknowns of single epochs than emission times would have to be fitted after each projection
     simple = problem.layout.size == problem.layout.n_shared or bool(problem.emitting)
-    left = np.flatnonzero((status != Status.OK) & ~is_on(problem.take(item), face, x)) if simple and face else []
+    if not (simple and face):
+        return x, cost, status
+    left = np.flatnonzero((status != Status.OK) & ~is_on(problem.take(item), face, x))
     if not len(left):
         return x, cost, status
     again, least, code = descend_along(problem.take(item[left]), face, start[left])

@@ -124,7 +124,7 @@ def _within(problem: Problem, face: Face, x: Array) -> tuple[Array, Array, Array
     along = tangent_at(problem, face, x)
     with np.errstate(all="ignore"):
         information, vector, _ = marginal(equations_at(problem, x))
-    usable: Array = np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1)
+    usable: Array = np.asarray(np.isfinite(information).all((-1, -2)) & np.isfinite(vector).all(-1))
     across = np.swapaxes(along, -1, -2)
     information = np.where(usable[:, None, None], information, np.eye(along.shape[-2]))
     vector = np.where(usable[:, None], vector, 0.0)

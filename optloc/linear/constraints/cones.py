@@ -45,7 +45,7 @@ def is_held(problem: Problem, face: Face, x: Array, descent: Array, information:
     """
     gradients = levels(problem, face, x)[1]
     # beyond every finite distance nothing has a gradient, and nothing is a minimum
-    out: Array = np.isfinite(gradients).all((-1, -2)) & np.isfinite(descent).all(-1)
+    out: Array = np.asarray(np.isfinite(gradients).all((-1, -2)) & np.isfinite(descent).all(-1))
     gradients, descent = np.where(out[:, None, None], gradients, 0.0), np.where(out[:, None], descent, 0.0)
     if information is not None:
         out &= np.isfinite(information).all((-1, -2))
