@@ -53,7 +53,7 @@ def shown(notebook):
         texts = {output.name: output.text} if "text" in output else output.get("data", {})
         found += [
             (number, kind, " ".join(_FIGURE.sub("", text).split()))
-            for kind, text in texts.items()
+            for kind, text in sorted(texts.items())  # files have them in another order
             if not kind.startswith("image/")
         ]
     return found
