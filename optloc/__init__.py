@@ -87,7 +87,7 @@ set_renderer(lambda: import_module("optloc.show.fixes"))
 _FORMS = {"sites": "optloc.sites.site_forms"}
 set_short_forms(lambda folder: import_module(_FORMS.get(folder, "optloc.show.short_forms")))
 # Neighbours draw their own values; the folder `show` draws the values of the core.
-set_plots(lambda folder: import_module("optloc.sites.site_plots" if folder == "sites" else "optloc.show.plots"))
+set_plots(lambda folder: import_module("optloc.sites.site_plots" if folder == "sites" else "optloc.show.core_plots"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

@@ -1,7 +1,7 @@
 """Every class of the core with a method `plot` has its drawing function."""
 
 from optloc.problem import Fix, Problem
-from optloc.show.plots import PLOTS
+from optloc.show.core_plots import PLOTS
 from optloc.tracking import Track
 
 
