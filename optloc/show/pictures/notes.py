@@ -70,8 +70,9 @@ def separate_notes(figure: Figure, panels: Sequence[Axes] | None = None) -> None
     """
     from matplotlib.text import Annotation
 
-    # Sizes of texts are known only after the layout of the figure.
-    figure.draw_without_rendering()
+    # Sizes of texts are known only after the layout of the whole figure, also for a part of a figure.
+    whole: Any = figure
+    whole.figure.draw_without_rendering()
     for panel in figure.axes if panels is None else panels:
         notes = [text for text in panel.texts if isinstance(text, Annotation) and _movable(text)]
         if not notes:

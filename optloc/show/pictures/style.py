@@ -67,7 +67,9 @@ def axes_or_new(ax: Axes | None, width: float = 6.4, height: float = 5.6) -> Axe
 
 def fix_limits(panel: Axes) -> None:
     """Lay out the figure of a plan, and keep its limits: notes and insets depend on them."""
-    panel.figure.draw_without_rendering()
+    part: Any = panel.figure
+    # The figure of a part of a figure is the whole figure.
+    part.figure.draw_without_rendering()
     panel.set(xlim=panel.get_xlim(), ylim=panel.get_ylim())
     panel.set_aspect("equal", adjustable="box")
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from optloc.sites.placement.placement_map import Loss
+    from optloc.sites.placement.placement_map import StationLoss
 
 PRIOR = 0.01
 """Share of the prior in the variance at a place; above it, the sites alone do not determine the position."""
@@ -539,9 +539,9 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
     return plot_placement(*made, losses_of(found), found.sigma, titles)
 
 
-def losses_of(found: Placement) -> list[Loss]:
+def losses_of(found: Placement) -> list[StationLoss]:
     """Return the loss of each taken station as standard deviations, largest first."""
-    from optloc.sites.placement.placement_map import Loss
+    from optloc.sites.placement.placement_map import StationLoss
 
     root = [np.sqrt(np.maximum([one.value, one.replaced], 0.0)).tolist() for one in found.swaps]
-    return [Loss(one.name, a, one.replacement, b) for one, (a, b) in zip(found.swaps, root, strict=True)]
+    return [StationLoss(one.name, a, one.replacement, b) for one, (a, b) in zip(found.swaps, root, strict=True)]

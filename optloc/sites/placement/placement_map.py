@@ -38,7 +38,7 @@ _NAMED, _FAR = 16, 5e3
 _LOSSES = 12
 
 
-class Loss(NamedTuple):
+class StationLoss(NamedTuple):
     """The effect of the loss of one station on the criterion, as standard deviations.
 
     - name: the station.
@@ -58,7 +58,7 @@ def plot_placement(
     taken: Sequence[Array],
     places: Array,
     weights: Array,
-    losses: Sequence[Loss],
+    losses: Sequence[StationLoss],
     value: float,
     titles: Sequence[str],
 ) -> Figure:
@@ -74,7 +74,7 @@ def plot_placement(
         Places of interest, in the coordinates of the maps.
     weights : array (P,)
         Weights of the places.
-    losses : sequence of Loss
+    losses : sequence of StationLoss
         Losses of the taken stations, largest first.
     value : float
         The criterion of the taken stations as a standard deviation, metres.
@@ -175,7 +175,7 @@ def _mark(
     axes.set_ylim(found.y[0] * scale, found.y[-1] * scale)
 
 
-def draw_losses(axes: Axes, losses: Sequence[Loss], value: float) -> None:
+def draw_losses(axes: Axes, losses: Sequence[StationLoss], value: float) -> None:
     """Draw the criterion without each of the stations as bars, and with the best replacement as marks.
 
     `value` is the criterion of all taken stations, metres. A station without which no fix is possible has a text.

@@ -7,7 +7,7 @@ pytest.importorskip("matplotlib", reason="pictures need matplotlib")
 
 from optloc.bounds import BoundMap
 from optloc.sites.placement import placement_map
-from optloc.sites.placement.placement_map import Loss, plot_placement
+from optloc.sites.placement.placement_map import StationLoss, plot_placement
 
 
 def maps(side):
@@ -31,7 +31,7 @@ def drawn(monkeypatch):
 
 def draw(side):
     taken = np.array([[True, True, False], [True, True, True]])
-    losses = [Loss("A", np.inf, "", np.inf), Loss("C", 5.0, "D", 3.0)]
+    losses = [StationLoss("A", np.inf, "", np.inf), StationLoss("C", 5.0, "D", 3.0)]
     places = np.array([[0.5, 0.5]]) * side
     return plot_placement(maps(side), taken, places, np.ones(1), losses, 2.0, ("before", "after"))
 
