@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -126,7 +126,7 @@ def _finish(panel: Axes, title: str) -> None:
     handles, labels = panel.get_legend_handles_labels()
     shown = dict(zip(labels, handles, strict=True))
     if shown:
-        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
         panel.legend(shown.values(), shown, frameon=False, fontsize=SMALL, **place)
     fix_limits(panel)
 

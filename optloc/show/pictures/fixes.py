@@ -6,7 +6,7 @@ A panel shows two axes of the scene, its view, in a unit of `size` metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -89,7 +89,7 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     figure = figure_class()(figsize=size, layout="constrained")
     if count < 3:
         return figure, figure.subplots(1, count, squeeze=False)[0].tolist()
-    names = [["plan", "around"], ["height", "height"]]
+    names: Any = [["plan", "around"], ["height", "height"]]
     made = figure.subplot_mosaic(names, height_ratios=[2.0, 1.0])
     return figure, [made["plan"], made["height"], made["around"]]
 

@@ -11,7 +11,7 @@ from optloc.base.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
     from matplotlib.text import Annotation
 
 # Positions of a note around its point, in points of 1/72 inch, the usual one first; and the alignment of its text.
@@ -62,7 +62,7 @@ def scale_bar(panel: Axes, unit: str, taken: str = "") -> None:
     panel.add_artist(bar)
 
 
-def separate_notes(figure: Figure, panels: Sequence[Axes] | None = None) -> None:
+def separate_notes(figure: Figure | SubFigure, panels: Sequence[Axes] | None = None) -> None:
     """Move the notes of a finished figure, or of some panels, so that none covers another note or a mark.
 
     A note stays in its panel. It takes the first free position around its point. If no position is free, it covers

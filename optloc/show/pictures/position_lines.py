@@ -115,7 +115,7 @@ def draw_lines(
     the line. If there are many pairs, the lines are faded and have no names.
     """
     from matplotlib.collections import LineCollection
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import to_hex, to_rgb
 
     pairs = list(dict.fromkeys((one.kind, one.name) for one in found))
     faded = len(pairs) > _NAMED_LINES
@@ -137,8 +137,8 @@ def draw_lines(
             spot = _free_spot(panel, own, limits, spots)
             if spot is not None:
                 spots.append(spot)
-                dark = tuple(_DARKER * part for part in to_rgb(looks[pair][0]))
-                note(panel, pair[1], *spot.tolist(), colour=dark)
+                red, green, blue = (_DARKER * part for part in to_rgb(looks[pair][0]))
+                note(panel, pair[1], float(spot[0]), float(spot[1]), to_hex((red, green, blue)))
 
 
 def _free_spot(panel: Axes, line: Array, limits: Array, spots: Sequence[Array]) -> Array | None:

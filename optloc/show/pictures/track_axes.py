@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def track_axes(
     scale = time_scale(track.times)
     if what == "plan":
         draw_plan(panel, lines, stations, axes, () if problem is None else problem.stations.names)
-        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
         panel.legend(frameon=False, fontsize=SMALL, **place)
         fix_limits(panel)
         scale_bar(panel, panel.get_xlabel().rpartition("(")[2].rstrip(")"))
