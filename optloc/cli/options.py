@@ -150,7 +150,7 @@ class CommandGroup(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Return the arguments left; without arguments, print the help and end with exit code 0."""
-        if not args:
+        if not args and not ctx.resilient_parsing:  # completion parses without arguments, too
             typer.echo(ctx.get_help(), nl=False)
             raise typer.Exit
         return super().parse_args(ctx, args)

@@ -52,3 +52,9 @@ def test_statuses_continue_after_each_comma():
 )
 def test_the_shell_offers_values_of_options(line, value):
     assert value in offered(line)
+
+
+@pytest.mark.parametrize(("line", "value"), [("optloc ca", "calibrate"), ("optloc study re", "report")])
+def test_the_shell_offers_commands(line, value):
+    assert value in offered(line)
+    assert "Usage:" not in offered(line)

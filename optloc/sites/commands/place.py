@@ -202,7 +202,8 @@ def _show(loaded: LoadedSelection, selection: SiteSelection, found: Placement) -
     sure = "" if found.closed else " (not closed)"
     say(console, f"{loaded.title}: take {', '.join(found.chosen) or 'nothing'}.")
     words = {"rms": "mean bound", "volume": "mean axis of the ellipsoid", "axis": "longest axis of the ellipsoid"}
-    least = f"{words[found.criterion]} {found.sigma:.4g} m, no choice below {np.sqrt(max(found.bound, 0.0)):.4g} m"
+    none = "no choice that is not rejected" if found.banned else "no choice"
+    least = f"{words[found.criterion]} {found.sigma:.4g} m, {none} below {np.sqrt(max(found.bound, 0.0)):.4g} m"
     say(console, f"{least[0].upper()}{least[1:]}{sure}: {found.reason}.")
     console.print(_places_table(selection, found))
     console.print(_losses_table(found))

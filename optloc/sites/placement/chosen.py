@@ -205,7 +205,7 @@ def place(
         Candidates, places and rules.
     draws : int
         Simulated fixes at each place that check the set for ambiguity. If a set fails the check, the next best
-        set is tried, at most `selection.alternatives` times. 0: no check.
+        set is tried, at most `selection.alternatives` times. If all fail, the best set is returned. 0: no check.
     tell : callable of (bound, value, nodes)
         Progress callback during the search, in the units of the criterion.
 
@@ -224,7 +224,7 @@ def place(
     S. Joshi and S. Boyd, "Sensor selection via convex optimization", IEEE Trans. Signal Process. 57 (2009).
     """
     candidates = candidates_of(selection)
-    task, banned = task_of(candidates), list[Array]()
+    task, banned, first = task_of(candidates), list[Array](), None
     while True:
         found = search(
             _ban_sets(task, banned),
@@ -235,12 +235,17 @@ def place(
             tell=tell,
         )
         if not found.best:
-            what = "no set of sites meets the rules" if not banned else "all sets that meet the rules are ambiguous"
-            raise InvalidProblem(what, "groups", "relax the rules of a group, choose fewer sites, or add candidates")
+            if first is None:
+                advice = "relax the rules of a group, choose fewer sites, or add candidates"
+                raise InvalidProblem("no set of sites meets the rules", "groups", advice)
+            return _placement(candidates, task, *first, [])
         chosen = found.best[0][1]
         checked = drawn(candidates, chosen, draws, selection.seed) if draws else None
-        if checked is None or checked.clean or len(banned) >= selection.alternatives:
+        if checked is None or checked.clean:
             return _placement(candidates, task, found, checked, banned)
+        first = first or (found, checked)
+        if len(banned) >= selection.alternatives:  # all sets are as ambiguous as the best, so nothing is gained
+            return _placement(candidates, task, *first, [])
         banned.append(chosen)
 
 
@@ -284,11 +289,12 @@ def _placement(
     gap = max(0.0, 1.0 - bound / reached)
     before, sites = _bounds_before(candidates, task)
     per_place, share = _bound_and_prior_share(candidates, chosen)
-    claim = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
+    others = "no set of these candidates" + (", except the rejected sets," if banned else "")
+    claim = f"{others} has a value more than {100 * gap:.2g} % lower"
     reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
     if selection.choose is not None and (count := int(new.sum())) < selection.choose:
-        reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget or do not help"
+        reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget, do not help or are ambiguous"
     return Placement(
         _select_names(names, new),
         _select_names(names, candidates.state == 1),

@@ -186,6 +186,17 @@ def test_a_set_whose_fixes_are_ambiguous_is_given_up_for_the_next(monkeypatch):
     assert found.banned == (best.alternatives[0][0],)
     assert found.chosen == best.alternatives[1][0]
     assert found.value == pytest.approx(best.alternatives[1][1], rel=1e-9)
+    assert "except the rejected sets" in found.reason
+
+
+@pytest.mark.parametrize("choose", [1, 4])
+def test_the_best_set_is_returned_if_all_sets_are_ambiguous(monkeypatch, choose):
+    asked = replace(selection(gap=1e-6), choose=choose)
+    dirty = np.ones(4)
+    monkeypatch.setattr(chosen_module, "drawn", lambda *args: Draws(10, dirty, dirty, dirty, dirty))
+    found, best = place(asked, draws=10), place(asked)
+    assert (found.chosen, found.banned, found.bound) == (best.chosen, (), best.bound)
+    assert not found.draws.clean
 
 
 @pytest.mark.parametrize("ground", few(["hill", None], 1))
