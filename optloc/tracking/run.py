@@ -154,7 +154,13 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
         2 or 3.
     """
     times = np.array([entry.time for entry in entries])
-    return collect(times, [(entry.updated, np.asarray(int(entry.code))) for entry in entries], dimension)
+    return collect(times, [(entry.updated, np.asarray(int(_status_of(entry)))) for entry in entries], dimension)
+
+
+def _status_of(entry: Entry) -> Status:
+    """Return the status of an entry in a track; a scan before the start has no state, so that it is not ok."""
+    alone = entry.event == "starting" and entry.code == Status.OK
+    return Status.TOO_FEW_ROWS if alone else Status(int(entry.code))
 
 
 @dataclass(frozen=True, slots=True)
