@@ -23,6 +23,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import UNCHECKED, Columns, records
 from optloc.show.knowledge import known_features
+from optloc.show.origin_time import iso_of
 
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
@@ -36,6 +37,8 @@ _CORNERS = 72
 # Times from this value on, s, count from 1970; smaller times count from the start of a run. A run is shorter than the
 # three years that this value means.
 _DATED = 1e8
+# Dates in names have the digits of this standard deviation, s: milliseconds, as the time stamps of KML and GPX.
+_SHOWN_TIME = 0.01
 
 
 class Other(NamedTuple):
@@ -286,7 +289,7 @@ class Results:
         """Return the name of a row: target, label or number, and epoch, each only if the table has several."""
         own = "label" if "label" in row else "number"
         several = [n for n in ("target", own, "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
-        return " ".join(str(row[name]) for name in several) or str(row.get("target", "fix"))
+        return " ".join(_label(row, name) for name in several) or str(row.get("target", "fix"))
 
     def _others(self) -> list[tuple[Other, ...]]:
         """Return the alternatives of each row; empty unless each row is one estimated position."""
@@ -352,6 +355,14 @@ class Results:
             planes = level_planes(problem, fix.position.reshape(-1, problem.dimension))
             found += outlines_of(problem, fix, [planes])
         return {i: each[0] for i, each in enumerate(found) if each}
+
+
+def _label(row: dict[str, Any], name: str) -> str:
+    """Return the text of a column of a row; for an epoch without a label, whose text is its time, the date in UTC."""
+    text, time = str(row[name]), row.get("time")
+    if name != "epoch" or time is None or time < _DATED or text != f"{time:.15g}":
+        return text
+    return iso_of(time, _SHOWN_TIME)
 
 
 def _region(frame: Frame, centre: Array, region: Outline) -> dict[str, Any]:

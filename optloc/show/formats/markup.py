@@ -46,7 +46,8 @@ def _iso(when: datetime) -> str:
 
 def _number(value: float, digits: int = _METRES) -> str:
     """Return a number as decimal text without an exponent, as XML schemas require."""
-    return f"{value:.{digits}f}"
+    # Adding 0.0 after rounding turns -0.0 into 0.0.
+    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _courses(marks: Sequence[Mark]) -> Iterator[tuple[str, list[list[Mark]]]]:

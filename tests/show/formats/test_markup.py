@@ -28,6 +28,31 @@ def test_kml_has_the_place_of_each_station_and_fix():
     assert document.find(f"{KML}Document/{KML}name").text.startswith("a <b>")
 
 
+@pytest.mark.parametrize(
+    ("epochs", "times", "names"),
+    [
+        (
+            ["1782900000", "1782900005.25"],
+            [1782900000.0, 1782900005.25],
+            ["2026-07-01T10:00:00", "2026-07-01T10:00:05"],
+        ),
+        (["first", "second"], [1782900000.0, 1782900005.25], ["first", "second"]),
+        (["0", "5"], [0.0, 5.0], ["0", "5"]),
+    ],
+)
+def test_an_epoch_without_a_label_is_named_by_its_date(epochs, times, names):
+    columns = {name: np.repeat(values, 2) for name, values in fix_columns(ranged()[1]).items()}
+    columns |= {"epoch": np.array(epochs, dtype=object), "time": np.array(times)}
+    found = [mark.name for mark in Results(columns, ENU).marks()]
+    assert all(name.startswith(start) for name, start in zip(found, names, strict=True)), found
+
+
+def test_a_height_of_zero_has_no_sign():
+    level = mark_of(ENU, np.array([0.0, 0.0, -1e-9]), np.eye(3), "ok", name="m", target="m", time=1_700_000_000.0)
+    assert level.place[2] < 0.0
+    assert ET.fromstring(event(level)).find("point").get("hae") == "0.000"
+
+
 def test_gpx_has_the_covariance_along_east_and_north():
     document = ET.fromstring(gpx(results()))
     kinds = [point.find(f"{GPX}type").text for point in document.iter(f"{GPX}wpt")]
