@@ -57,6 +57,7 @@ from optloc.solvers.certificates.branch_and_bound import (
     state_claims,
     unknown_claim,
 )
+from optloc.solvers.certificates.known_positions import certified_linear, is_linear
 from optloc.solvers.certificates.moving_medium import certified_at_rest, problem_at_rest
 from optloc.solvers.certificates.out_of_reach import edges_of, out_of_reach
 from optloc.solvers.certificates.position_cost import (
@@ -94,6 +95,8 @@ def certified(
     `region` (2, d) has the corners of the requested box, metres, as of `certify`. `margin` is the gap of cost to prove
     to other minima. `effort` multiplies the number of boxes that a proof may use.
     """
+    if pool is not None and not pool.loss and region is None and is_linear(problem):
+        return certified_linear(problem, pool, margin)
     still = problem_at_rest(problem)
     if still is not None and pool is not None and not pool.loss:
         return certified_at_rest(problem, pool, still, certified, region, margin, effort)
