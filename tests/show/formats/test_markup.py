@@ -48,7 +48,7 @@ def test_an_epoch_without_a_label_is_named_by_its_date(epochs, times, names):
 
 
 def test_a_height_of_zero_has_no_sign():
-    level = mark_of(ENU, np.array([0.0, 0.0, -1e-9]), np.eye(3), "ok", name="m", target="m", time=1_700_000_000.0)
+    level = mark_of(ENU, np.array([0.0, 0.0, -400.0001]), np.eye(3), "ok", name="m", target="m", time=1_700_000_000.0)
     assert level.place[2] < 0.0
     assert ET.fromstring(event(level)).find("point").get("hae") == "0.000"
 
