@@ -294,8 +294,15 @@ def _placement(
     reason = claim if found.closed else f"the time limit ended the search: {claim}; raise the time limit or the gap"
     new = (chosen == 1) & (candidates.state != 1)
     if selection.choose is not None and (count := int(new.sum())) < selection.choose:
+<<<<<<< HEAD
         more = "more exceed the budget, do not help or are ambiguous"
         reason += f"; only {count} of the {selection.choose} wanted sites: {more}"
+||||||| e7e2930e
+        reason += f"; only {count} of the {selection.choose} wanted sites: more exceed the budget, do not help or are ambiguous"
+=======
+        reason += f"; only {count} of the {selection.choose} wanted sites: "
+        reason += "more exceed the budget, do not help or are ambiguous"
+>>>>>>> tasksb
     return Placement(
         _select_names(names, new),
         _select_names(names, candidates.state == 1),
