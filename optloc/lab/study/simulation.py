@@ -248,15 +248,8 @@ def _size_of(problem: Problem, name: str) -> int:
 def metres(values: list[Amount], where: str, count: int | None = None) -> Array:
     """Return amounts of length as an array in metres; raise InvalidProblem if their number is not `count`."""
     if count is not None and len(values) != count:
-<<<<<<< HEAD
-        what = f"{len(values)} numbers do not fit {count} dimensions"
-        raise InvalidProblem(what, where, "give one for each, or set dimension")
-||||||| e7e2930e
-        raise InvalidProblem(f"{len(values)} numbers do not fit {count} dimensions", where, "give one for each, or set dimension")
-=======
         advice = "give one for each, or set dimension"
         raise InvalidProblem(f"{len(values)} numbers do not fit {count} dimensions", where, advice)
->>>>>>> tasksb
     return np.array([Units("length").plain(value, "m", where) for value in values])
 
 
