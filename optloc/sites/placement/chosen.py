@@ -12,20 +12,24 @@ Arguments of many functions: `candidates` are the sites as arrays, `task` is the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from formulations.placement import covariances
-from optloc.bounds import bound_map, crlb, extent, map_coordinates
+from optloc.bounds import BoundMap, bound_map, crlb, extent, map_coordinates
 from optloc.engine import degrees_of_freedom, simulate
-from optloc.problem import Array, HasShortForm, InvalidProblem, Status
+from optloc.problem import Array, HasShortForm, InvalidProblem, Problem, Status, plot_of
 from optloc.sites.placement.best_set import BestSetResult, SearchTask, random_sets, search
 from optloc.sites.placement.sites import LETTER, Candidates, SiteSelection, candidates_of
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from optloc.sites.placement.placement_map import StationLoss
 
 PRIOR = 0.01
 """Share of the prior in the variance at a place; above it, the sites alone do not determine the position."""
@@ -148,6 +152,8 @@ class Placement(HasShortForm):
         Positions of the k new sites after continuous refinement, metres.
     refined_value : float
         The criterion at these positions, square metres; the bound does not apply to it. NaN without refinement.
+    selection : SiteSelection, optional
+        The selection that was passed to `place`, for pictures.
     """
 
     chosen: tuple[str, ...]
@@ -173,6 +179,11 @@ class Placement(HasShortForm):
     banned: tuple[tuple[str, ...], ...] = ()
     refined: Array | None = None
     refined_value: float = float("nan")
+    selection: SiteSelection | None = field(default=None, repr=False)
+
+    def plot(self, **options: Any) -> Axes:
+        """Return a map of the bound in matplotlib axes; see `optloc.sites.placement_axes` for the options."""
+        return plot_of(self, **options)
 
     @property
     def sigma(self) -> float:
@@ -307,6 +318,7 @@ def _placement(
         found.nodes,
         checked,
         tuple(_select_names(names, one == 1) for one in banned),
+        selection=selection,
     )
 
 
@@ -460,8 +472,56 @@ def _thickness_over_bound(candidates: Candidates, chosen: Array, bounds: Array) 
     return out
 
 
+class PlacementMaps(NamedTuple):
+    """Maps of the bound before and after a placement (P places, s candidates).
+
+    - maps: the bound with the stations before, and with the taken stations.
+    - taken: two arrays (s,), True for the stations of each map.
+    - places (P, 2), weights (P,): places of interest in the coordinates of the maps.
+    """
+
+    maps: tuple[BoundMap, BoundMap]
+    taken: tuple[Array, Array]
+    places: Array
+    weights: Array
+
+
+def maps_of(selection: SiteSelection, found: Placement) -> PlacementMaps:
+    """Return the maps of a placement; raise InvalidProblem if the selection takes single rows.
+
+    `selection` was passed to `place`, and `found` is its result.
+    """
+    problem, names = selection.problem, np.array(selection.problem.stations.names)
+    if selection.by == "row":
+        raise InvalidProblem("a choice of single rows has no map", "plot", "choose stations")
+    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
+    truth = np.zeros(problem.layout.size)
+    truth[: problem.dimension] = places[0]
+    flat = map_coordinates(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
+    height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
+    x0, x1, y0, y1 = extent(problem, places, widen=0.08)
+    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
+    end = np.concatenate([rows.a for rows in problem.rows])
+    before, after = (np.isin(names, sites) for sites in (found.before_sites, (*found.chosen, *found.kept)))
+    bound = partial(_bound_with, single, truth, grid, height, end)
+    weights = np.ones(len(places)) if selection.weights is None else np.asarray(selection.weights)
+    return PlacementMaps((bound(before), bound(after)), (before, after), flat[:, :2], weights)
+
+
+def _bound_with(
+    single: Problem, truth: Array, grid: tuple[Array, Array], height: float, end: Array, mask: Array
+) -> BoundMap:
+    """Return the map of the bound with the stations of a mask (s,).
+
+    `single` is the problem of all candidates, and `truth` are its unknowns at one place. `grid` are the grid lines in
+    x and y. `height` is the height of the map, m. `end` (m,) are the stations of the rows.
+    """
+    return bound_map(single.with_rows(weight=single.weight * mask[end]), truth, *grid, height)
+
+
 def picture(selection: SiteSelection, found: Placement) -> Figure:
-    """Return a figure: maps of the bound before and after on one scale, and the gap during the search.
+    """Return a figure: maps of the bound before and after on one scale, and the loss of each station.
 
     Parameters
     ----------
@@ -477,29 +537,18 @@ def picture(selection: SiteSelection, found: Placement) -> Figure:
     """
     from optloc.sites.placement.placement_map import plot_placement
 
-    problem, names = selection.problem, np.array(selection.problem.stations.names)
-    if selection.by == "row":
-        raise InvalidProblem("a choice of single rows has no map", "plot", "choose stations")
-    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
-    places = np.atleast_2d(np.asarray(selection.places, dtype=float))[:, : problem.dimension]
-    truth = np.zeros(problem.layout.size)
-    truth[: problem.dimension] = places[0]
-    flat = map_coordinates(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
-    height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
-    x0, x1, y0, y1 = extent(problem, places, widen=0.08)
-    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
-    end = np.concatenate([rows.a for rows in problem.rows])
-    maps, taken = [], []
-    for sites in (found.before_sites, (*found.chosen, *found.kept)):
-        mask = np.isin(names, sites)
-        maps.append(bound_map(single.with_rows(weight=single.weight * mask[end]), truth, *grid, height))
-        taken.append(mask)
-    weights = np.ones(len(places)) if selection.weights is None else np.asarray(selection.weights)
-    course: Array = found.course.copy()
-    course[:, 1:] = np.sqrt(np.maximum(course[:, 1:], 0.0))
+    made = maps_of(selection, found)
     kept = set(found.before_sites) == set(found.kept)
     titles = (
         "before: kept stations" if kept else "before: a random set",
         f"after: {found.sigma:.3g} m{', one failed' * selection.fail_one}",
     )
-    return plot_placement(maps, taken, flat[:, :2], weights, course, titles)
+    return plot_placement(*made, losses_of(found), found.sigma, titles)
+
+
+def losses_of(found: Placement) -> list[StationLoss]:
+    """Return the loss of each taken station as standard deviations, largest first."""
+    from optloc.sites.placement.placement_map import StationLoss
+
+    root = [np.sqrt(np.maximum([one.value, one.replaced], 0.0)).tolist() for one in found.swaps]
+    return [StationLoss(one.name, a, one.replacement, b) for one, (a, b) in zip(found.swaps, root, strict=True)]
