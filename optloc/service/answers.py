@@ -16,7 +16,7 @@ import numpy as np
 
 from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
-from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, live_mark, mark_of
+from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, ellipse95, live_mark, mark_of
 from optloc.tracking import Entry
 
 Record = dict[str, Any]
@@ -223,13 +223,24 @@ def _finite(value: Any) -> Any:
 # Other formats.
 
 
-def to_feature(record: Record) -> Record:
-    """Return a record as a GeoJSON feature (RFC 7946); the geometry is null without a position on Earth."""
-    place = None
-    if record.get("lat_deg") is not None:
-        place = {"type": "Point", "coordinates": [record["lon_deg"], record["lat_deg"], record["height"]]}
+def to_feature(record: Record, frame: Frame) -> Record:
+    """Return a record as a GeoJSON feature (RFC 7946); the geometry is null without a position on Earth.
+
+    Its properties are the entries of the record. Where the 95 % ellipse is valid, they also have `ellipse95_1` and
+    `ellipse95_2`, its semi-axes, m, `ellipse95_bearing`, the bearing of the long axis, degrees, and the standard
+    deviations `sigma_east`, `sigma_north` and `sigma_up`, m.
+    """
     left_out = ("lat_deg", "lon_deg", "height", "position", "cov")
     about = {key: value for key, value in record.items() if key not in left_out}
+    if record.get("lat_deg") is None:
+        return {"type": "Feature", "geometry": None, "properties": about}
+    place = {"type": "Point", "coordinates": [record["lon_deg"], record["lat_deg"], record["height"]]}
+    mark = to_mark(record, frame)
+    if mark.covers:
+        major, minor, bearing = ellipse95(mark.level)
+        sigma = np.sqrt(np.maximum(np.diagonal(mark.level), 0.0)).tolist()
+        about |= {"ellipse95_1": major, "ellipse95_2": minor, "ellipse95_bearing": bearing}
+        about |= dict(zip(("sigma_east", "sigma_north", "sigma_up"), sigma, strict=False))
     return {"type": "Feature", "geometry": place, "properties": about}
 
 
@@ -310,7 +321,7 @@ def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | N
 
 FORMATS: Mapping[str, Callable[[Record, Frame], bytes | None]] = {
     "ndjson": lambda record, _: to_line(record),
-    "geojson": lambda record, _: to_line(to_feature(record)),
+    "geojson": lambda record, frame: to_line(to_feature(record, frame)),
     "aircraft": lambda record, _: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
     **{name: _of_file(one.each) for name, one in FILE_FORMATS.items() if one.each is not None},
 }
@@ -371,9 +382,10 @@ class Latest:
         now = time()
         return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
 
-    def features(self) -> Record:
-        """Return the latest fixes as a GeoJSON feature collection."""
-        return {"type": "FeatureCollection", "features": [to_feature(record) for _, record in self._present()]}
+    def features(self, frame: Frame) -> Record:
+        """Return the latest fixes as a GeoJSON feature collection; `frame` is the frame of the site."""
+        shown = [to_feature(record, frame) for _, record in self._present()]
+        return {"type": "FeatureCollection", "features": shown}
 
     def marks(self, frame: Frame) -> Record:
         """Return the latest fixes for the live map: `now` and `last` event (s since 1970, None without one), `fixes`.
@@ -391,7 +403,8 @@ class Latest:
                 mark = live_mark(frame, to_mark(record, frame), trail) | {"received": round(now - age, 3)}
                 drawn = self._drawn[name] = (record, _finite(mark))
             found.append(drawn[1])
-        return {"now": round(now, 3), "last": self._last, "fixes": found}
+        last = None if self._last is None else round(self._last, 3)  # rounded as `now`, so that it is never later
+        return {"now": round(now, 3), "last": last, "fixes": found}
 
     def aircraft(self) -> Record:
         """Return the latest fixes as readsb's ``aircraft.json``."""

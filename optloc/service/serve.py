@@ -99,14 +99,16 @@ def application(stream: Stream, *, local: bool = True) -> Any:
         text = stream.metrics.text(stream.clock())
         return Response(text, headers={"Content-Type": "text/plain; version=0.0.4; charset=utf-8"})
 
+    # Features and marks in a thread, because many new fixes take some milliseconds.
+
     async def fixes(_: Any) -> Any:
-        return JSONResponse(stream.latest.features(), media_type="application/geo+json")
+        found = await asyncio.to_thread(stream.latest.features, stream.site.frame)
+        return JSONResponse(found, media_type="application/geo+json")
 
     async def aircraft(_: Any) -> Any:
         return JSONResponse(stream.latest.aircraft())
 
     async def marks(_: Any) -> Any:
-        # In a thread, because many new fixes take some milliseconds.
         return JSONResponse(await asyncio.to_thread(stream.latest.marks, stream.site.frame))
 
     async def page(_: Any) -> Any:

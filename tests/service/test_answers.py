@@ -54,11 +54,21 @@ def test_a_proof_that_was_not_finished_keeps_the_status():
 
 
 def test_features_and_aircraft_have_the_place_on_earth():
-    feature = to_feature(FIX)
+    bare = {name: value for name, value in FIX.items() if name != "cov"}
+    feature = to_feature(bare, ECEF)
     assert feature["geometry"]["coordinates"] == [11.25, 47.5, 3048.0]
     assert feature["properties"] == {"event": "7", "phase": "fix", "status": "ok"}
-    assert to_feature({"event": "7", "status": "stalled", "position": None})["geometry"] is None
+    assert to_feature({"event": "7", "status": "stalled", "position": None}, ECEF)["geometry"] is None
     assert (to_aircraft(FIX)["alt_geom"], to_aircraft(FIX)["hex"]) == (10000, "7")  # feet
+
+
+def test_a_feature_has_the_ellipse_and_the_sigmas_of_an_ok_fix_only():
+    record = FIX | {"cov": np.diag([9.0, 9.0, 9.0]).tolist()}
+    found = to_feature(record, ECEF)["properties"]
+    assert [found[f"sigma_{axis}"] for axis in ("east", "north", "up")] == pytest.approx([3.0, 3.0, 3.0])
+    # 5.991 is the 95 % quantile of chi-square with two degrees of freedom
+    assert found["ellipse95_1"] == pytest.approx(3.0 * np.sqrt(5.991), rel=1e-4)
+    assert "ellipse95_1" not in to_feature(record | {"status": "misfit"}, ECEF)["properties"]
 
 
 def test_a_mark_is_at_the_position_of_its_record():
@@ -83,7 +93,7 @@ def test_the_latest_fix_of_each_target_is_kept_and_the_oldest_leave():
         latest(FIX | {"event": name, "phase": "fix"})
     latest({"event": "c", "phase": "proof", "proof": "global"})
     latest({"event": "d", "position": None})
-    found = latest.features()["features"]
+    found = latest.features(ECEF)["features"]
     assert [feature["properties"]["event"] for feature in found] == ["b", "c"]
     assert found[1]["properties"]["proof"] == "global"
     assert latest.aircraft()["messages"] == 3

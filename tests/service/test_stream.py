@@ -498,13 +498,13 @@ def test_fixes_on_earth_are_features_and_aircraft(tmp_path):
     sent = lines[0][:-1] + b', "target": "4b1234"}'
     (record,) = answers(site, [sent], phases="one")[0]
     assert record["lat_deg"] == pytest.approx(47.5, abs=0.1)
-    feature = to_feature(record)
+    feature = to_feature(record, site.frame)
     assert feature["geometry"]["coordinates"] == [record["lon_deg"], record["lat_deg"], record["height"]]
     assert feature["properties"]["target"] == "4b1234"
     plane = to_aircraft(record)
     assert (plane["hex"], plane["type"]) == ("4b1234", "mlat")
     assert plane["alt_geom"] == round(record["height"] / 0.3048)
-    assert to_feature({"error": "x", "line": 1})["geometry"] is None
+    assert to_feature({"error": "x", "line": 1}, site.frame)["geometry"] is None
 
 
 def test_fixes_on_earth_are_events_and_sentences(tmp_path):

@@ -191,6 +191,13 @@ def ellipse(level: Array) -> tuple[float, float, float]:
     return float(major), float(minor), float(np.degrees(np.arctan2(vectors[0, 1], vectors[1, 1])) % 180.0)
 
 
+def ellipse95(level: Array) -> tuple[float, float, float]:
+    """Return the semi-axes of the 95 % ellipse of a level covariance, m, and the bearing of the major axis, degrees."""
+    scale = float(error_ellipse(np.eye(2))[0][0])
+    major, minor, bearing = ellipse(level)
+    return scale * major, scale * minor, bearing
+
+
 @dataclass(frozen=True, slots=True)
 class Results:
     """Fixes or tracks, ready to write.

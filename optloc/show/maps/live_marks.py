@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from optloc.base.frames import Frame
-from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
-from optloc.show.formats.marks import Mark, ellipse
+from optloc.show.formats.marks import Mark, ellipse95
 from optloc.show.maps.map_marks import map_row
 
 # Decimals of a degree, and of a metre, in the feed: a tenth of a millimetre.
@@ -41,9 +40,7 @@ def live_mark(frame: Frame, mark: Mark, trail: Sequence[Array] = ()) -> dict[str
     texts = {name: getattr(row, name) for name in ("name", "time", "status", "look", "place", "copied", "size", "note")}
     axes = None
     if mark.covers:
-        major, minor, bearing = ellipse(mark.level)
-        scale = float(error_ellipse(np.eye(2))[0][0])
-        axes = [scale * major, scale * minor, bearing]
+        axes = list(ellipse95(mark.level))
     places = [_place(frame, position) for position in trail]
     return {**texts, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
 
