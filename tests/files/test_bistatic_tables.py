@@ -1,6 +1,7 @@
 """Tables of bistatic delays, of confidences, and of differences with rows of the reference station itself."""
 
 import math
+import re
 
 import pytest
 
@@ -97,7 +98,7 @@ def test_results_are_also_in_the_unit_of_the_stations(tmp_path):
     (tmp_path / "t.csv").write_text("station,range_cm\n" + ranges)
     words = ["fix", str(tmp_path / "t.csv"), "--stations", str(tmp_path / "cm.csv"), "--sigma", "5 cm"]
     shown = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out.csv")])
-    assert "The position is x = 400000 cm, y = 300000 cm." in shown.stdout
+    assert re.search(r"in cm +│ x = 400000 cm, y = 300000 cm", shown.stdout), shown.stdout
     fix = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["fixes"][0]
     assert [fix["x_cm"], fix["y_cm"]] == pytest.approx([4e5, 3e5], abs=1.0)
     assert [fix["x"], fix["y"]] == pytest.approx(TARGET, abs=0.01)

@@ -113,7 +113,7 @@ BAD = {
     "unknown key": ('kind = "height"\nminimum = 3', ["'minimum'", "did you mean 'min'"]),
     "key of another kind": ('kind = "height"\nmin = 1\ncorners = [[0, 0]]', ["height has no key 'corners'"]),
     "key of none": ('kind = "above-ground"\nmin = 1', ["above-ground has no key 'min'"]),
-    "nothing": ('kind = "height"', ["has no bound", "exactly or min or max"]),
+    "nothing": ('kind = "height"', ["has no bound", "exactly or one_of or min or max"]),
     "exact and a band": ('kind = "height"\nexactly = 1\nmin = 0', ["exact or in a band"]),
     "unknown unit": ('kind = "height"\nmin = "3 mm/h"', ["[[constraints]] 1", "'mm/h'"]),
     "unit of another quantity": ('kind = "height"\nmin = "3 deg"', ["'deg'", "length"]),

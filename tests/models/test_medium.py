@@ -171,7 +171,7 @@ def test_pictures_are_drawn_of_rates_along_rays():
     stations = Stations(floor_and_surface()[None], tuple("ABCDEF"), velocity=np.ones((1, 6, 3)))
     rows = [rows_of("toa", 6, 0.3), measured("range_rate", a=np.arange(6), sigma=0.01)]
     problem = simulate(assemble(stations, *rows, medium=CRUST), np.array([300.0, 500.0, -700.0, 0.0]), 1)
-    with mock.patch("optloc.show.pictures.fixes._GRID", 63):
+    with mock.patch("optloc.show.pictures.position_lines._GRID", 63):
         figure = plot_fixes(problem, solve(problem))
     assert any("one toa" in text.get_text() for text in figure.legends[0].get_texts())
 

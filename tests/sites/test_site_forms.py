@@ -29,8 +29,8 @@ MAKERS = {
     "calibration": lambda: calibrate(network()),
     "placement": lambda: place(selection()),
     "posed placement": lambda: pose_placement(selection()),
-    # A few pulses: posing a program of 30 pulses takes a minute.
-    "posed network": lambda: pose_network(network().take(np.arange(6))),
+    # As few pulses as the program allows: posing 30 pulses takes a minute.
+    "posed network": lambda: pose_network(network().take(np.arange(10))),
 }
 
 
