@@ -108,7 +108,7 @@ def test_a_command_tells_misfits_under_an_exact_height(tmp_path):
     done = CliRunner().invoke(app, [*words, "--box=-inf,-inf,1:inf,inf,1"])
     said = " ".join(done.output.split()).lower()
     assert done.exit_code == 1, done.output
-    assert "6 of 6 fixes" in said and said.count("misfit") >= 6, said
+    assert said.count("misfit") >= 6, said
     assert "the noise level is the suspect: 6 of 6 fixes do not fit" in said
     # the equality decides between a place and its mirror image already
     assert "mirror image" not in said
