@@ -23,7 +23,8 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # MathJax and its fonts lie beside the pages
 ]
-exclude_patterns = ["_build", "changes", "examples"]  # changes are parts of CHANGELOG.md
+# The changes are parts of CHANGELOG.md. The gallery offers its notebooks as downloads beside its pages.
+exclude_patterns = ["_build", "changes", "examples", "gallery/*.ipynb"]
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
