@@ -37,8 +37,8 @@ finally:
 # parameter vectors; three for tables of tapes, for how plans are drawn, and for the one refinement of the long way;
 # one for columns of words in tables; one for the lines of sight that the Earth may block; two for mirror images in the
 # plane of the stations, and whether both sides of it are alike; two for laws that bounds cut off; six for constraints,
-# fences and their checks, once one module; six for waves, their speeds, phases and physical checks of tables; one for the
-# horizon, once a part of the inequalities; one for the time of emission.
+# fences and their checks, once one module; six for waves, their speeds, phases and physical checks of tables; one for
+# the horizon, once a part of the inequalities; one for the time of emission.
 MOST = 100
 
 

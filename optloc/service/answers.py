@@ -226,9 +226,9 @@ def _finite(value: Any) -> Any:
 def to_feature(record: Record, frame: Frame) -> Record:
     """Return a record as a GeoJSON feature (RFC 7946); the geometry is null without a position on Earth.
 
-    Its properties are the entries of the record. Where the 95 % ellipse is valid, they also have `ellipse95_1` and
-    `ellipse95_2`, its semi-axes, m, `ellipse95_bearing`, the bearing of the long axis, degrees, and the standard
-    deviations `sigma_east`, `sigma_north` and `sigma_up`, m.
+    Its properties are the entries of the record. Where the 95 % ellipse is valid, they also have its semi-axes, m,
+    `ellipse95_1` and `ellipse95_2`, and `ellipse95_bearing`, the bearing of the long axis, degrees. The standard
+    deviations, m, are `sigma_east`, `sigma_north` and `sigma_up`.
     """
     left_out = ("lat_deg", "lon_deg", "height", "position", "cov")
     about = {key: value for key, value in record.items() if key not in left_out}
