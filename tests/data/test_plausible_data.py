@@ -19,9 +19,9 @@ MOST = 200
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_measured_values_cause_no_sentence(name):
+def test_measured_values_cause_no_sentence(name, data_dir):
     guard = SETS[name]
-    problem = datasets.load(guard.name, **guard.options).problem
+    problem = datasets.load(guard.name, folder=data_dir, **guard.options).problem
     refuse_impossible(problem, lambda number: f"row {number}", "python")
     assert suspicious_values(problem) == ()
     batch = batch_of(problem)
