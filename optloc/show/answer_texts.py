@@ -23,7 +23,8 @@ _UNLIKELY = 1e-3
 _RATES = (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²"))
 
 # The radius is the size of one minimum. If another position is not excluded, it says nothing about the choice.
-_CONFIRMED = {Status.OK.label, Status.CURVED.label}
+# "started" is the label of the first scan of a track, whose state is a fix with status `ok`.
+_CONFIRMED = {Status.OK.label, Status.CURVED.label, "started"}
 _CONDITION = ", if this position is correct"
 _REFUTED = "not valid: the residuals are larger than the stated noise allows"
 
@@ -125,8 +126,8 @@ def sure_rows(columns: Columns, i: int) -> list[Row]:
 
 def is_gaussian(columns: Columns, i: int) -> bool:
     """Return whether the ellipse of row `i` is valid: it is finite, and the error is Gaussian in metres."""
-    semi = [columns[name][i] for name in ("ellipse95_1", "ellipse95_2", "ellipse95_3") if name in columns]
-    return bool(np.isfinite(semi).all()) and columns["chart"][i] in {"", NAMES[CARTESIAN]}
+    chart = columns["chart"][i] if "chart" in columns else ""
+    return bool(np.isfinite(level_covariance(columns, i)).all()) and chart in {"", NAMES[CARTESIAN]}
 
 
 def _radius_rows(columns: Columns, i: int) -> list[Row]:

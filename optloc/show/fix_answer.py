@@ -126,6 +126,14 @@ def verdict_of(status: Status) -> Verdict:
     return "care" if status in ANSWERED and status is not Status.MISFIT else "bad"
 
 
+def status_named(label: str) -> Status | None:
+    """Return the status with a label, such as "too few rows"; None for other texts, such as the events of a track."""
+    return _BY_LABEL.get(label)
+
+
+_BY_LABEL = {status.label: status for status in Status}
+
+
 def advice_lines(advice: Sequence[Advice]) -> list[str]:
     """Return observations with their advice as lines of text, and the lines to copy into a problem file."""
     lines = ["Advice"] if advice else []

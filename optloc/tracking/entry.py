@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -84,3 +85,32 @@ class Entry:
     def label(self) -> str:
         """Return the event, or the status if there is no event or if a start is not ok."""
         return self.event if self.event and self.code == Status.OK else self.code.label
+
+
+# The label of a scan has another meaning than the status of a fix: the state also contains the scans before it.
+_SENTENCES: Mapping[str, str] = {
+    Status.OK.label: "Use it: the rows of the scan agree with the predicted state, and its covariance is valid.",
+    "starting": "There is no state yet: this scan is a part of the start of the track.",
+    "started": "Use it: the state is a new fix of the first scans, and no other position fits them.",
+    "restarted": "The track was lost, and the state is a new fix; the states before it may be wrong.",
+    Status.TOO_FEW_ROWS.label: "The scan has no valid row, so the state is only predicted; its covariance grows until "
+    "rows arrive.",
+    Status.REJECTED.label: "Most rows of the scan do not fit the prediction or are not finite; check the stations, the "
+    "noise and the motion model.",
+    Status.MISFIT.label: "Do not use it: the innovations are larger than the stated noise allows; check the stations, "
+    "the noise and the motion model.",
+    Status.UNBOUNDED.label: "Do not use it: the position is too uncertain for the stations; add a station or an "
+    "initial state.",
+    Status.AMBIGUOUS.label: "Other states of the start also fit the scans; later scans may decide, or give an initial "
+    "state.",
+    Status.NUMERICAL.label: "The update of the state failed; check the scale and the units of the input.",
+    Status.CURVED.label: "The start is right, but its covariance is not valid; later scans or an initial state help.",
+}
+
+
+def scan_sentence(label: str) -> str:
+    """Return the sentence of the label of a scan (`Entry.label`): whether to use its state, and what helps.
+
+    A label that has the same meaning as the status of a fix has the sentence of the status.
+    """
+    return _SENTENCES.get(label) or Status[label.upper().replace(" ", "_")].sentence
