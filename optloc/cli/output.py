@@ -18,11 +18,10 @@ from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
-from optloc.base.types import Status
 from optloc.kernels.progress import Reporter
 from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
-from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of
+from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,7 +97,7 @@ def _status_colour(label: str) -> str:
     """Return the colour of a status: green for ok, yellow for other answers, red for no answer; "" for no status."""
     if not label:
         return ""
-    return _COLOURS[verdict_of(Status[label.upper().replace(" ", "_")])]
+    return _COLOURS[verdict_of_label(label)]
 
 
 def say_all(console: Console, sentences: Sequence[str]) -> None:

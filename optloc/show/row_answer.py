@@ -6,10 +6,12 @@ The answer of a fix, the marks of maps and exports, the live map, tracks and sep
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base.types import NOTES, Status
+from optloc.base.frames import Frame
+from optloc.base.types import NOTES, Array, Status
 from optloc.problem.fix import Fix
 from optloc.show.answer_texts import (
     NOT_DETERMINED,
@@ -19,8 +21,16 @@ from optloc.show.answer_texts import (
     place_rows,
     sure_rows,
 )
-from optloc.show.columns import RESCALED, ROBUST, TAILS, UNCHECKED, Columns
-from optloc.show.fix_answer import AnswerSection, FixAnswer, Row, Verdict, status_named, verdict_of
+from optloc.show.columns import (
+    RESCALED,
+    ROBUST,
+    TAILS,
+    UNCHECKED,
+    Columns,
+    covariance_columns,
+    geodetic_columns,
+)
+from optloc.show.fix_answer import AnswerSection, FixAnswer, Row, Verdict, status_named, verdict_of_label
 from optloc.show.knowledge import has_place, known_rows
 
 _NOTED = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
@@ -60,14 +70,8 @@ def row_answer(
 
 def row_verdict(columns: Columns, i: int) -> Verdict:
     """Return whether to use a row: a row without redundancy with care, other rows according to their status."""
-    status = status_named(columns["status"][i])
-    verdict = "good" if status is None and columns["status"][i] in _GOOD_EVENTS else "care"
-    verdict = verdict if status is None else verdict_of(status)
+    verdict = verdict_of_label(str(columns["status"][i]))
     return "care" if verdict == "good" and _unchecked(columns, i) else verdict
-
-
-# Labels of scans of a track that are no status of a fix, and whose state is valid.
-_GOOD_EVENTS = {"started"}
 
 
 def _unchecked(columns: Columns, i: int) -> bool:
@@ -118,16 +122,53 @@ def why_rows(columns: Columns, i: int) -> tuple[Row, ...]:
     return (*rows, ("also found", ", ".join(others))) if others else tuple(rows)
 
 
-def state_columns(position: np.ndarray, covariance: np.ndarray, **named: object) -> Columns:
-    """Return the table of one state with its position (d,), m, and covariance (d, d), m^2; `named` are other columns.
+class RowSource(NamedTuple):
+    """A row of a table, with what its answer needs.
 
-    The table has the coordinates of the frame only.
+    - columns: the table.
+    - number: number of the row.
+    - sentence: sentence of the status; empty for the sentence of `Status`.
+    - fixes: batch with the fix of the row, if each row of the table is a fix; else None.
+    - item: number of the fix in the batch.
     """
-    from optloc.show.columns import covariance_columns
 
-    axes = "xyz"[: len(position)]
-    sigma = np.sqrt(np.diagonal(covariance))
-    columns: Columns = {axis: position[k : k + 1] for k, axis in enumerate(axes)}
-    columns |= {f"sigma_{axis}": sigma[k : k + 1] for k, axis in enumerate(axes)}
-    columns |= covariance_columns(covariance[None], "xyz")
-    return columns | {name: np.array([value], dtype=object) for name, value in named.items()}
+    columns: Columns
+    number: int
+    sentence: str = ""
+    fixes: Fix | None = None
+    item: int = 0
+
+    @property
+    def answer(self) -> FixAnswer:
+        """Return the answer of the row."""
+        fix = None if self.fixes is None else self.fixes[self.item]
+        return row_answer(self.columns, self.number, fix, sentence=self.sentence)
+
+
+def state_table(frame: Frame, position: Array, covariance: Array, rates: Array | None = None, **texts: Any) -> Columns:
+    """Return the table of states that are known by their numbers only.
+
+    Parameters
+    ----------
+    frame : Frame
+        Frame of the positions.
+    position : array (n, d)
+        Positions, m; NaN if unknown.
+    covariance : array (n, m, m)
+        Covariances of the state, m^2: m = d for the position, or m >= 2 d for position and velocity; NaN if unknown.
+    rates : array (n, d), optional
+        Velocities, m/s.
+    **texts
+        Other columns (n), such as `status` and `reason`.
+    """
+    d = position.shape[-1]
+    columns: Columns = {name: np.asarray(values, dtype=object) for name, values in texts.items()}
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    known = covariance.shape[-1] >= 2 * d
+    for k, axis in enumerate("xyz"[:d]):
+        columns |= {axis: position[:, k], f"sigma_{axis}": sigma[:, k]}
+        if rates is not None:
+            unknown = np.full(len(position), np.nan)
+            columns |= {f"v{axis}": rates[:, k], f"sigma_v{axis}": sigma[:, d + k] if known else unknown}
+    placed = covariance[:, :d, :d]
+    return columns | covariance_columns(placed, "xyz") | geodetic_columns(frame, position, placed)

@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.short_form import ShortForm
 from optloc.base.types import Array, Status
 from optloc.show.answer_texts import finite, with_sigma
+from optloc.show.describe_emitters import answer_of_emitters
 from optloc.show.fix_answer import FixSheet, Row
 from optloc.show.render import html_of_sheet, sheet_lines
 
@@ -163,12 +164,14 @@ def _prepared(prepared: Prepared) -> ShortForm:
 
 def _emitters(emitters: Emitters) -> ShortForm:
     """Return the short form of separated emitters: status, positions, and rows without an emitter."""
-    rows: list[Row] = [("status", emitters.status.label), ("", emitters.status.sentence)]
-    rows += [("reason", emitters.reason)] if emitters.reason else []
-    for i, fix in enumerate(emitters.fixes[:_NAMES]):
-        place = ", ".join(f"{value:.1f}" for value in fix.position)
-        rows.append((f"emitter {i + 1}", f"{place} m from {len(emitters.rows(i))} rows; {fix.status.label}"))
-    rows.append(("false rows", str(int((emitters.assignment < 0).sum()))))
+    answer = answer_of_emitters(emitters)
+    rows = [*answer.section("use").rows, *answer.section("why not").rows[:2]]
+    for sheet in answer.section("where").sheets:
+        # The last column is the status, and each row begins with the number of the emitter.
+        names = sheet.head[1:-3]
+        for row in sheet.rows[:_NAMES]:
+            place = ", ".join(f"{name.removesuffix(', m')} {cell}" for name, cell in zip(names, row[1:-3], strict=True))
+            rows.append((f"emitter {row[0]}", f"{place}; {row[-1]}"))
     return ShortForm(f"{emitters.count} emitters", tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
 
 
