@@ -17,6 +17,7 @@ from optloc.show.answer_texts import (
     as_p,
     finite,
     place_rows,
+    sigma_of,
     sure_rows,
     undetermined_names,
     with_sigma,
@@ -166,7 +167,7 @@ def _cells(columns: Columns, i: int, names: Sequence[str]) -> list[str]:
     """Return numbers of row `i` with their standard deviations as cells; "-" if not determined."""
     undetermined = undetermined_names(columns, i)
     return [
-        with_sigma(float(columns[name][i]), float(columns[f"sigma_{name}"][i]), "").strip()
+        with_sigma(float(columns[name][i]), sigma_of(columns, name, i), "").strip()
         if name not in undetermined and np.isfinite(columns[name][i])
         else "-"
         for name in names

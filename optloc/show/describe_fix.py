@@ -76,7 +76,9 @@ def answer_of(
     """
     columns = fix_columns(fix) if columns is None else columns
     if fix.shape:
-        sections = _batch_sections(fix, columns, details, most)
+        by = [str(name) for name in fix.label_names if name is not None]
+        sheet = state_sheet(columns, f"Fixes by {', '.join(by)}" if by else "Fixes", most)
+        sections = _batch_sections(fix, columns, details, sheet)
         return FixAnswer(title, _batch_verdict(fix), sections, tuple(advice))
     if not title and fix.labels is not None:
         title = f"fix {fix.labels[()]}"
@@ -144,8 +146,8 @@ def _batch_verdict(fix: Fix) -> Verdict:
     return "good" if bool((fix.code == Status.OK).all()) and not bool(np.any(fix.unchecked)) else "care"
 
 
-def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], most: int) -> tuple[AnswerSection, ...]:
-    """Return the sections of a batch: counts in words, the table of fixes, counts by status, and reasons."""
+def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], sheet: FixSheet) -> tuple[AnswerSection, ...]:
+    """Return the sections of a batch: counts in words, the table of fixes `sheet`, counts by status, and reasons."""
     if not fix.code.size:
         return (AnswerSection("use", (("status", "0 fixes"),)),)
     alone = int(np.asarray(columns["unchecked"], dtype=bool).sum())
@@ -159,7 +161,7 @@ def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], most: in
     return _present(
         [
             AnswerSection("use", tuple(use)),
-            AnswerSection("where", (), (state_sheet(columns, "Fixes", most), count_sheet(columns))),
+            AnswerSection("where", (), (sheet, count_sheet(columns))),
             AnswerSection("why not", (*why, *_reason_rows(columns))),
             AnswerSection("details", rows),
         ]

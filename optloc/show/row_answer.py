@@ -12,8 +12,10 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.types import NOTES, Array, Status
+from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.show.answer_texts import (
+    CURVED_ROW,
     NOT_DETERMINED,
     extent_rows,
     motion_rows,
@@ -108,7 +110,8 @@ def _sure_rows(columns: Columns, i: int, fix: Fix | None) -> tuple[Row, ...]:
     Without a valid position, the section has the directions and ranges that the data determine.
     """
     known = [] if fix is None else known_rows(fix)
-    intervals = [] if fix is None else extent_rows(fix)
+    other_chart = "chart" in columns and columns["chart"][i] not in {"", NAMES[CARTESIAN]}
+    intervals = [CURVED_ROW] * other_chart if fix is None else extent_rows(fix)
     without_place = bool(known) and fix is not None and not has_place(fix)
     return (*sure_rows(columns, i), *(known if without_place else [*intervals, *known]))
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # A short form has at most 15 lines and 1 000 characters: at most 12 rows of about 80 characters.
 _ROWS, _LABEL, _LONGEST = 12, 20, 64
+# The sentence of a status, in a row without a label, is never cut: it has the advice at its end.
+_SENTENCE = 200
 # Names in one line; further names are counted.
 _NAMES = 4
 
@@ -42,7 +44,7 @@ def html_of_form(form: ShortForm) -> str:
 
 def _sheet(form: ShortForm) -> FixSheet:
     """Return a short form as a sheet, with long texts cut."""
-    rows = [(_cut(label, _LABEL), _cut(text)) for label, text in form.rows[:_ROWS]]
+    rows = [(_cut(label, _LABEL), _cut(text, _LONGEST if label else _SENTENCE)) for label, text in form.rows[:_ROWS]]
     return FixSheet(_cut(form.title), (), [*rows, *([("next", form.following)] if form.following else [])])
 
 
@@ -172,7 +174,8 @@ def _emitters(emitters: Emitters) -> ShortForm:
         for row in sheet.rows[:_NAMES]:
             place = ", ".join(f"{name.removesuffix(', m')} {cell}" for name, cell in zip(names, row[1:-3], strict=True))
             rows.append((f"emitter {row[0]}", f"{place}; {row[-1]}"))
-    return ShortForm(f"{emitters.count} emitters", tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
+    title = f"{emitters.count} emitter{'s' if emitters.count != 1 else ''}"
+    return ShortForm(title, tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
 
 
 FORMS: dict[str, Callable[[Any], ShortForm]] = {
