@@ -2,7 +2,7 @@
 
 import html
 import re
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def plain(text):
 
 def first(document, tag):
     """Return the text of the first element of an XML document with a tag of any namespace."""
-    return next(one.text for one in ElementTree.fromstring(document).iter() if one.tag.rpartition("}")[2] == tag)
+    return next(one.text for one in ET.fromstring(document).iter() if one.tag.rpartition("}")[2] == tag)
 
 
 def outputs(fix):
@@ -91,7 +91,7 @@ def test_the_summary_of_a_track_has_the_words_of_its_marks(tmp_path):
     result = CliRunner().invoke(app, ["track", str(tmp_path / "run.toml"), "--out", str(out)], env={"COLUMNS": "300"})
     assert result.exit_code == 0, result.output
     descriptions = [
-        one.text for one in ElementTree.fromstring(out.read_text()).iter() if one.tag.endswith("description")
+        one.text for one in ET.fromstring(out.read_text()).iter() if one.tag.endswith("description")
     ]
     last = [text for text in descriptions if "sigma" in text][-1]
     words = plain(result.stdout)
