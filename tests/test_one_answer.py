@@ -90,9 +90,7 @@ def test_the_summary_of_a_track_has_the_words_of_its_marks(tmp_path):
     out = tmp_path / "run.kml"
     result = CliRunner().invoke(app, ["track", str(tmp_path / "run.toml"), "--out", str(out)], env={"COLUMNS": "300"})
     assert result.exit_code == 0, result.output
-    descriptions = [
-        one.text for one in ET.fromstring(out.read_text()).iter() if one.tag.endswith("description")
-    ]
+    descriptions = [one.text for one in ET.fromstring(out.read_text()).iter() if one.tag.endswith("description")]
     last = [text for text in descriptions if "sigma" in text][-1]
     words = plain(result.stdout)
     assert scan_sentence("ok") in last

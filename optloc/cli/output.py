@@ -54,8 +54,8 @@ def say(console: Console, line: str) -> None:
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-# Least width of a column of words, which wrap.
-_LEAST = 8
+# Least width of a column of words: words up to the second width are not split, longer words are.
+_LEAST, _WORD = 8, 14
 _COLOURS = {"good": "green", "care": "yellow", "bad": "red"}
 
 
@@ -76,11 +76,14 @@ def show_sheet(sheet: FixSheet, console: Console, colour: str = "") -> None:
     table = Table(title=sheet.title or None, title_justify="left", show_header=bool(sheet.head), min_width=width)
     needed = 1
     for place, name in enumerate(sheet.head):
-        cells_of_column = [row[place] for row in sheet.rows]
+        cells_of_column = [line for row in sheet.rows for line in row[place].splitlines()]
         numeric = name not in TEXT_COLUMNS
         # A number on two lines is misread. So a table that is too wide for the screen continues beyond its edge.
-        least = max(map(len, cells_of_column), default=0) if numeric else _LEAST
-        table.add_column(name, justify="right" if numeric else "left", min_width=least)
+        words = max((len(word) for line in cells_of_column for word in line.split()), default=0)
+        least = max(map(len, cells_of_column), default=0) if numeric else min(max(words, _LEAST), _WORD)
+        # Headings wrap between words only: a part of a word cannot be read.
+        least = max(least, *map(len, name.split()), 1)
+        table.add_column(name, justify="right" if numeric else "left", min_width=least, overflow="fold")
         needed += least + 3
     for number, row in enumerate(sheet.rows):
         cells: list[str | Text] = list(row)

@@ -16,7 +16,7 @@ from optloc.model_checks.geometry import Advice
 SECTIONS = ("use", "where", "how sure", "why not", "details")
 """Names of the sections in the order in which every output prints them."""
 
-TEXT_COLUMNS = {"fix", "emitter", "epoch", "target", "status", "name", "member", "estimate", "suspect"}
+TEXT_COLUMNS = {"fix", "emitter", "epoch", "target", "status", "name", "member", "estimate", "suspect", "method"}
 """Columns of words, which are aligned to the left; columns of numbers are aligned to the right."""
 
 Section = Literal["use", "where", "how sure", "why not", "details"]

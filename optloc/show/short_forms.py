@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from optloc.base.frames import Frame
     from optloc.multi_target.answer import Emitters
     from optloc.problem.problem import Problem
+    from optloc.show.sheet import Sheet
     from optloc.solvers.posing.posed import Posed
     from optloc.solvers.prepared import Prepared
     from optloc.tracking.track import Track
     from optloc.uncertainty.region import Region
 
 # A short form has at most 15 lines and 1 000 characters: at most 12 rows of about 80 characters.
-_ROWS, _LABEL, _LONGEST = 12, 20, 64
+_ROWS, _LABEL, _LONGEST, _TITLE = 12, 32, 64, 100
 # The sentence of a status, in a row without a label, is never cut: it has the advice at its end.
 _SENTENCE = 200
 # Names in one line; further names are counted.
@@ -45,7 +46,7 @@ def html_of_form(form: ShortForm) -> str:
 def _sheet(form: ShortForm) -> FixSheet:
     """Return a short form as a sheet, with long texts cut."""
     rows = [(_cut(label, _LABEL), _cut(text, _LONGEST if label else _SENTENCE)) for label, text in form.rows[:_ROWS]]
-    return FixSheet(_cut(form.title), (), [*rows, *([("next", form.following)] if form.following else [])])
+    return FixSheet(_cut(form.title, _TITLE), (), [*rows, *([("next", form.following)] if form.following else [])])
 
 
 def _cut(text: str, most: int = _LONGEST) -> str:
@@ -178,6 +179,14 @@ def _emitters(emitters: Emitters) -> ShortForm:
     return ShortForm(title, tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
 
 
+def _table(table: Sheet) -> ShortForm:
+    """Return the short form of a table of a report: its columns and its first rows."""
+    shown = table.shown
+    rows: list[Row] = [("columns", listed(shown.header, 12)), ("rows", str(len(shown.rows)))]
+    rows += [(cells[0], ", ".join(cells[1:])) for cells in shown.rows[:_NAMES]]
+    return ShortForm(f"Table: {shown.title}", tuple(rows), "sheet.frame, sheet.shown.markdown()")
+
+
 FORMS: dict[str, Callable[[Any], ShortForm]] = {
     "Problem": _problem,
     "Track": _track,
@@ -185,5 +194,6 @@ FORMS: dict[str, Callable[[Any], ShortForm]] = {
     "Posed": _posed,
     "Prepared": _prepared,
     "Emitters": _emitters,
+    "Sheet": _table,
 }
 """Short forms of the values of the core, by the name of the class."""
