@@ -86,9 +86,8 @@ def test_headings_of_statuses_are_whole_words_at_any_width(width):
 
 def test_headings_of_pairs_fit_in_80_characters():
     medians = Median(-0.0012, -0.0034, 0.0011, 0.5), Median(1.2, 0.98, 1.4, 0.5)
-    one = Pair(
-        "case", "1 ns", "gauss-newton from the box", "auto", 1000, 120, 130, 0.5, 0.4, 0.6, 0.031, median, median
-    )
+    share = (0.5, 0.4, 0.6)
+    one = Pair("case", "1 ns", "gauss-newton from the box", "auto", 1000, 120, 130, *share, 0.031, *medians)
     stream = StringIO()
     _show_pairs([one], Console(file=stream, width=80))
     lines = stream.getvalue().splitlines()
