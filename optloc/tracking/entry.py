@@ -91,20 +91,21 @@ class Entry:
 _SENTENCES: Mapping[str, str] = {
     Status.OK.label: "Use it: the rows of the scan agree with the predicted state, and its covariance is valid.",
     "starting": "There is no state yet: this scan is a part of the start of the track.",
-    "started": "Use it: the state is a new fix of the first scans, and no other position fits them.",
-    "restarted": "The track was lost, and the state is a new fix; the states before it may be wrong.",
-    Status.TOO_FEW_ROWS.label: "The scan has no valid row, so the state is only predicted; its covariance grows until "
-    "rows arrive.",
-    Status.REJECTED.label: "Most rows of the scan do not fit the prediction or are not finite; check the stations, the "
-    "noise and the motion model.",
-    Status.MISFIT.label: "Do not use it: the innovations are larger than the stated noise allows; check the stations, "
-    "the noise and the motion model.",
-    Status.UNBOUNDED.label: "Do not use it: the position is too uncertain for the stations; add a station or an "
-    "initial state.",
-    Status.AMBIGUOUS.label: "Other states of the start also fit the scans; later scans may decide, or give an initial "
-    "state.",
-    Status.NUMERICAL.label: "The update of the state failed; check the scale and the units of the input.",
-    Status.CURVED.label: "The start is right, but its covariance is not valid; later scans or an initial state help.",
+    "started": "Use it: the state is the fix of this scan and of the scans before it.",
+    "restarted": "Use it: the state is a new fix of the last scans. The track before it was lost.",
+    "lost": "There is no state: the track has ended, and the next scans start a new track.",
+    Status.TOO_FEW_ROWS.label: "Use it with its larger covariance: the scan has no valid row, so the state is only "
+    "predicted.",
+    Status.REJECTED.label: "Most rows of the scan did not pass the gate or are not finite; check the outliers, and try "
+    "a robust loss.",
+    Status.MISFIT.label: "Do not use it: the innovations are larger than the stated noise allows; check sigma, the "
+    "process noise and the motion model.",
+    Status.UNBOUNDED.label: "Do not use it: the position is too uncertain to follow, so the track ends; add stations "
+    "or measurements.",
+    Status.AMBIGUOUS.label: "Several states of the start fit the scans about equally well; wait for more scans, or "
+    "give a start.",
+    Status.NUMERICAL.label: "The update failed, so the state is only predicted; the reason names the cause.",
+    Status.CURVED.label: "The state of the start is right, but its covariance is not valid; wait for more scans.",
 }
 
 
