@@ -26,8 +26,8 @@ def answer_of_scans(columns: Columns, title: str = "") -> FixAnswer:
     Parameters
     ----------
     columns : dict of str to array
-        Table of the scans in order, one row for each scan, with the columns `time`, `target`, `status`, `reason`,
-        `nis` and `rows`, and the state with its covariance; NaN before the start of a track.
+        Table of the scans in order, one row for each scan. It has the state with its covariance, NaN before the start
+        of a track, and the columns `epoch`, `time`, `target`, `status`, `reason`, `nis` and `rows`.
     title : str
         Title of the answer.
     """
