@@ -12,7 +12,7 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.types import NOTES, Array, Status
-from optloc.problem.chart import CARTESIAN, NAMES
+from optloc.problem.chart import CARTESIAN, CURVED, NAMES
 from optloc.problem.fix import Fix
 from optloc.show.answer_texts import (
     CURVED_ROW,
@@ -110,8 +110,8 @@ def _sure_rows(columns: Columns, i: int, fix: Fix | None) -> tuple[Row, ...]:
     Without a valid position, the section has the directions and ranges that the data determine.
     """
     known = [] if fix is None else known_rows(fix)
-    other_chart = "chart" in columns and columns["chart"][i] not in {"", NAMES[CARTESIAN]}
-    intervals = [CURVED_ROW] * other_chart if fix is None else extent_rows(fix)
+    curved = "chart" in columns and columns["chart"][i] == NAMES[CURVED]
+    intervals = [CURVED_ROW] * curved if fix is None else extent_rows(fix)
     without_place = bool(known) and fix is not None and not has_place(fix)
     return (*sure_rows(columns, i), *(known if without_place else [*intervals, *known]))
 
@@ -144,7 +144,10 @@ class RowSource(NamedTuple):
     @property
     def answer(self) -> FixAnswer:
         """Return the answer of the row."""
-        fix = None if self.fixes is None else self.fixes[self.item]
+        # A fix with status `ok` and a valid ellipse adds nothing to its row.
+        label, chart = (self.columns[name][self.number] if name in self.columns else "" for name in ("status", "chart"))
+        enough = label == Status.OK.label and chart in {"", NAMES[CARTESIAN]}
+        fix = None if self.fixes is None or enough else self.fixes[self.item]
         return row_answer(self.columns, self.number, fix, sentence=self.sentence)
 
 
