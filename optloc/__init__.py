@@ -84,7 +84,7 @@ if not TYPE_CHECKING:
 watch_old_packages()
 set_renderer(lambda: import_module("optloc.show.fixes"))
 # Neighbours describe their own values; the folder `show` describes the values of the core.
-_FORMS = {"sites": "optloc.sites.site_forms"}
+_FORMS = {"sites": "optloc.sites.site_forms", "lab": "optloc.lab.lab_forms"}
 set_short_forms(lambda folder: import_module(_FORMS.get(folder, "optloc.show.short_forms")))
 # Neighbours draw their own values; the folder `show` draws the values of the core.
 set_plots(lambda folder: import_module("optloc.sites.site_plots" if folder == "sites" else "optloc.show.core_plots"))

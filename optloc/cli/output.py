@@ -18,11 +18,10 @@ from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
-from optloc.base.types import Status
 from optloc.kernels.progress import Reporter
 from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
-from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of
+from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,8 +54,8 @@ def say(console: Console, line: str) -> None:
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-# Least width of a column of words, which wrap.
-_LEAST = 8
+# Least width of a column of words: words up to the second width are not split, longer words are.
+_LEAST, _WORD = 8, 14
 _COLOURS = {"good": "green", "care": "yellow", "bad": "red"}
 
 
@@ -77,11 +76,14 @@ def show_sheet(sheet: FixSheet, console: Console, colour: str = "") -> None:
     table = Table(title=sheet.title or None, title_justify="left", show_header=bool(sheet.head), min_width=width)
     needed = 1
     for place, name in enumerate(sheet.head):
-        cells_of_column = [row[place] for row in sheet.rows]
+        cells_of_column = [line for row in sheet.rows for line in row[place].splitlines()]
         numeric = name not in TEXT_COLUMNS
         # A number on two lines is misread. So a table that is too wide for the screen continues beyond its edge.
-        least = max(map(len, cells_of_column), default=0) if numeric else _LEAST
-        table.add_column(name, justify="right" if numeric else "left", min_width=least)
+        words = max((len(word) for line in cells_of_column for word in line.split()), default=0)
+        least = max(map(len, cells_of_column), default=0) if numeric else min(max(words, _LEAST), _WORD)
+        # Headings wrap between words only: a part of a word cannot be read.
+        least = max(least, *map(len, name.split()), 1)
+        table.add_column(name, justify="right" if numeric else "left", min_width=least, overflow="fold")
         needed += least + 3
     for number, row in enumerate(sheet.rows):
         cells: list[str | Text] = list(row)
@@ -98,7 +100,7 @@ def _status_colour(label: str) -> str:
     """Return the colour of a status: green for ok, yellow for other answers, red for no answer; "" for no status."""
     if not label:
         return ""
-    return _COLOURS[verdict_of(Status[label.upper().replace(" ", "_")])]
+    return _COLOURS[verdict_of_label(label)]
 
 
 def say_all(console: Console, sentences: Sequence[str]) -> None:
