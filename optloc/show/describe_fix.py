@@ -109,7 +109,7 @@ def _use_rows(fix: Fix) -> tuple[Row, ...]:
     verdict = Status(int(fix.code))
     noted = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
     notes = [UNCHECKED] * bool(fix.unchecked) + [words for note, words in noted.items() if fix.has(note)]
-    return ("status", "; ".join([verdict.label, *notes])), ("", verdict.sentence)
+    return ("status", "; ".join([verdict.label, *notes])), ("", fix.sentence)
 
 
 def _where(fix: Fix, columns: Columns, more: Sequence[Row], most: int) -> AnswerSection:
