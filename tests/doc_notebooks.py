@@ -11,8 +11,6 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "docs" / "notebooks").glob("*.ipynb"))
 # Seconds for one cell on a machine that is busy and makes machine code.
 _LIMIT = 600
-# The first run on a machine stores machine code and writes its progress to stderr.
-_PROGRESS = re.compile(r"(?:making|loading) machine code.*\n?")
 # Matplotlib prints the size of a figure, which depends on its version; the picture is next to it.
 _FIGURE = re.compile(r"<Figure size .*>")
 
@@ -31,14 +29,8 @@ def executed(path, folder):
         os.environ.update(kept)
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)  # times
-        if "outputs" in cell:
-            cell.outputs = [output for output in cell.outputs if not _is_progress(output)]
     notebook.metadata["language_info"] = {"name": "python"}
     return notebook
-
-
-def _is_progress(output):
-    return output.get("name") == "stderr" and not _PROGRESS.sub("", output.text).strip()
 
 
 def outputs(notebook):

@@ -19,7 +19,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible
 from optloc.base.types import Status
-from optloc.kernels.progress import Reporter
+from optloc.kernels.progress import Reporter, in_notebook
 from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
 from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of
@@ -40,6 +40,11 @@ class Screen(Console):
 
     def __init__(self, *, stderr: bool = False, quiet: bool = False) -> None:
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False)
+
+    @property
+    def shows_bars(self) -> bool:
+        """Return whether it can show progress bars: on a terminal, but not in the output of a notebook's cell."""
+        return self.is_terminal and not in_notebook()
 
     def render_str(self, text: str, **style: Any) -> Text:
         """Return printable text, with control characters as escapes."""
@@ -196,7 +201,7 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
 
     # Standard output may be piped, so the bar is on standard error. One step needs no bar.
     console = Screen(stderr=True)
-    shown = console.is_terminal and not quiet and total > 1
+    shown = console.shows_bars and not quiet and total > 1
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*parts, console=console, disable=not shown, transient=True) as progress:
         task = progress.add_task(title, total=total)
@@ -211,9 +216,9 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     # `known` has the latest numbers. On a terminal the bar shows them, so the lines are muted.
     console, known = Screen(stderr=True), [0, 0]
     lines = Reporter(lambda: f"{title}: {known[0]} of about {known[1]}")
-    lines.muted = quiet or console.is_terminal
+    lines.muted = quiet or console.shows_bars
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+    with Progress(*parts, console=console, disable=quiet or not console.shows_bars, transient=True) as progress:
         task = progress.add_task(title, total=None)
 
         def tell(done: int, total: int) -> None:
@@ -235,9 +240,9 @@ def line(quiet: bool) -> Iterator[Callable[[str], None]]:
 
     console, known = Screen(stderr=True), [""]
     lines = Reporter(lambda: known[0])
-    lines.muted = quiet or console.is_terminal
+    lines.muted = quiet or console.shows_bars
     parts = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+    with Progress(*parts, console=console, disable=quiet or not console.shows_bars, transient=True) as progress:
         task = progress.add_task("", total=None)
 
         def tell(text: str) -> None:

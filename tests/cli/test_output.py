@@ -60,6 +60,14 @@ def test_a_minus_is_standard_output(tmp_path, capsys):
     assert capsys.readouterr().out == (tmp_path / "a.txt").read_text() == "a line\n"
 
 
+def test_a_notebook_has_no_bars_although_its_commands_see_a_terminal(monkeypatch):
+    monkeypatch.delenv("JPY_PARENT_PID", raising=False)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    assert Screen(stderr=True).shows_bars
+    monkeypatch.setenv("JPY_PARENT_PID", "1")
+    assert not Screen(stderr=True).shows_bars
+
+
 def test_a_quiet_meter_prints_nothing(capsys):
     with meter("work", quiet=True) as tell:
         tell(1, 2)
