@@ -27,7 +27,6 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.files import make_folder, replace_together, write_text, written
-from optloc.problem import InvalidProblem
 from optloc.show import ABSENT, Picture, TextTable, figure_class
 
 if TYPE_CHECKING:
