@@ -17,7 +17,7 @@ from rich.text import Text
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
-from optloc.base.outputs import claim, is_stream, visible
+from optloc.base.outputs import claim, is_standard_output, is_stream, visible
 from optloc.base.types import Status
 from optloc.kernels.progress import Reporter, in_notebook
 from optloc.show.answer_sheets import UNCHECKED_MARK
@@ -120,7 +120,7 @@ def dumps(value: Any) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, or standard output for the path "-"; raise InvalidProblem if that fails."""
-    if str(path) == "-":
+    if is_standard_output(path):
         sys.stdout.write(text + "\n")
         return
     outputs.write_text(path, text + "\n")
@@ -146,6 +146,17 @@ def write_results(path: Path, results: Results) -> None:
 def is_csv(path: Path) -> bool:
     """Return whether a table is written as CSV; streams without an ending, such as a pipe, get CSV too."""
     return path.suffix.lower() == ".csv" or is_stream(path)
+
+
+def uses_standard_output(*paths: Path | None, as_json: bool = False) -> bool:
+    """Return whether one of the outputs, or JSON, goes to standard output; raise InvalidProblem if several do.
+
+    The command then prints its text for people to standard error.
+    """
+    count = sum(map(is_standard_output, paths))
+    if count + as_json > 1:
+        raise InvalidProblem("only one output can go to standard output", "-", "name a file for the other outputs")
+    return count > 0
 
 
 def claim_outputs(
@@ -176,6 +187,8 @@ def claim_outputs(
         from optloc.show.formats import format_of
 
         format_of(fixes, frame)
+    if is_standard_output(picture):
+        raise InvalidProblem("a picture is no text for standard output", "-", f"name a file: {', '.join(PICTURES)}")
     if picture is not None and picture.suffix.lower() not in PICTURES and not is_stream(picture):
         what = f"pictures of type {picture.suffix or picture.name!r} are unknown"
         raise InvalidProblem(what, str(picture), f"use {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
