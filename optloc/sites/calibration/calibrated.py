@@ -412,7 +412,7 @@ def _alternatives(
             shapes.append(shape)
             words = others[i][0]
             placed = one if soft else over(one, at)
-            # Starts reach the mirror image, too, so the name of a start does not tell it.
+            # Starts also end at the mirror image, so its shape decides the name.
             what = MIRROR_IMAGE if is_mirror_image(one, at, _ALIKE * scale) else words[0].upper() + words[1:]
             out.append(Alternative(what, max(gap, 0.0), placed.stations[0], placed.pulses[0]))
     return tuple(out)
