@@ -9,7 +9,8 @@ import sys
 # The libraries of the command line take half a second to load. Ctrl-C in this time ends the program without a
 # traceback.
 _NAME = os.path.basename("".join(sys.argv[:1]))  # noqa: PTH119  (pathlib takes its time, too)
-_RUNS = _NAME in {"optloc", "optloc.exe", "optloc-script.py"} or (_NAME == "-m" and "optloc.cli" in sys.orig_argv)
+_MODULES, _SCRIPTS = {"optloc", "optloc.cli"}, {"optloc", "optloc.exe", "optloc-script.py"}
+_RUNS = _NAME in _SCRIPTS or (_NAME == "-m" and not _MODULES.isdisjoint(sys.orig_argv))
 if _RUNS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 

@@ -22,7 +22,14 @@ from optloc.cli.output import (
     claim_outputs,
     dumps,
     is_csv,
+<<<<<<< HEAD
     show_answer,
+||||||| ae4d274e
+    say,
+=======
+    say,
+    uses_standard_output,
+>>>>>>> g2
     write_picture,
     write_results,
     write_text,
@@ -119,7 +126,8 @@ def run_track(
     dynamics = dynamics_of(wanted)
     # Reject wrong names before reading the file.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
-    loaded = read_problem(file, table, more, quiet=quiet or as_json)
+    on_output = uses_standard_output(out, html, as_json=as_json)
+    loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
@@ -144,8 +152,16 @@ def run_track(
             if as_json:
                 write_text(Path("-"), dumps(_json(loaded, columns)))
     if not quiet and not as_json:
+<<<<<<< HEAD
         show_answer(answer_of_scans(columns, loaded.title), Screen())
     return 0 if set(columns["status"].tolist()) <= CLEAN else 1
+||||||| ae4d274e
+        _show(loaded, columns, Screen())
+    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+=======
+        _show(loaded, columns, Screen(stderr=on_output))
+    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+>>>>>>> g2
 
 
 def _entries(

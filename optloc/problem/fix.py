@@ -18,7 +18,7 @@ from optloc.base.plots import plot_of
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
 from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
-from optloc.problem.claims import Claims
+from optloc.problem.claims import Claims, sentence_of
 from optloc.problem.determined import Determined
 from optloc.problem.explanations import Suspect
 from optloc.problem.layout import Layout
@@ -481,6 +481,11 @@ class Fix:
         for i, bits in enumerate(marks.tolist()):
             sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and bits & one.mark)
         return cast("tuple[Status, ...]", sets[index.reshape(self.shape)] if self.shape else sets[0])
+
+    @property
+    def sentence(self) -> str:
+        """Return the sentence of the status of a single fix, with advice that its method has not yet followed."""
+        return sentence_of(Status(int(self.code)), self.claims)
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points are in the regions that contain the target with a given probability.

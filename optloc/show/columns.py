@@ -400,7 +400,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
     others = fix.alternatives
     shown = np.isfinite(others.gap)
     return {
-        "sentence": Status(int(fix.code)).sentence,
+        "sentence": fix.sentence,
         "findings": [one.label for one in fix.findings],
         "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,

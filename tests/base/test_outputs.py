@@ -317,3 +317,12 @@ def test_what_is_read_again_is_written_as_it_is(place):
     run("simulate", "bad.toml", "--truth", "1500,2200,900", "--out", "again.toml")
     assert read(place / "again.toml").problem.stations.names == read(place / "bad.toml").problem.stations.names
     assert "'=" not in (place / "again-1.csv").read_text()
+
+
+def test_a_minus_is_standard_output_with_the_same_bytes(capfdbinary):
+    with outputs.written(Path("-")) as file:
+        file.write_bytes(b"a,b\r\n1,2\n")
+    assert capfdbinary.readouterr().out == b"a,b\r\n1,2\n"
+    assert outputs.is_stream(Path("-"))
+    outputs.claim(Path("-"), Path("-"))
+    assert not outputs.is_standard_output(None)

@@ -157,7 +157,7 @@ def report(
     from optloc.lab.report.study_page import write_report
 
     console = Screen(stderr=True)
-    shown = console.is_terminal and not quiet
+    shown = console.shows_bars and not quiet
     with console.status("report") if shown else nullcontext() as status:
         files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
     if not quiet:
@@ -407,7 +407,7 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
     console = Screen(stderr=True)
     counts: Counter[str] = Counter()
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    shown = console.is_terminal and not quiet
+    shown = console.shows_bars and not quiet
     with Progress(*parts, TextColumn("{task.fields[counts]}"), console=console, disable=not shown) as progress:
         task = progress.add_task(title, total=total, counts="")
 
