@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 from optloc.files import Budget, access, json_of, read_text
 from optloc.problem import InvalidProblem
 from optloc.service.answers import Record
-from optloc.service.events import Event, Events, name_under, picoseconds, rows_and_arrivals
+from optloc.service.events import Event, Events
+from optloc.service.messages import name_under, picoseconds, rows_and_arrivals
 from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 

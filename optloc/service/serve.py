@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from optloc.problem import InvalidProblem
 from optloc.service.answers import Record, to_line
-from optloc.service.events import LINE
+from optloc.service.messages import LINE
 from optloc.service.queues import WAITING, Ticket
 from optloc.service.site import Site
 from optloc.service.stream import Stream

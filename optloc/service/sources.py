@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from optloc.problem import InvalidProblem, nearest
-from optloc.service.events import LINE
+from optloc.service.messages import LINE
 from optloc.service.queues import WAITING
 from optloc.service.stream import Stream
 

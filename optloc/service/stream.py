@@ -23,7 +23,8 @@ from optloc.service import events as of_events
 from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
 from optloc.service.checkpoint import restore, state_of
 from optloc.service.engine import BATCH, Engine
-from optloc.service.events import LINE, Events, parse
+from optloc.service.events import Events
+from optloc.service.messages import LINE, parse
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
 from optloc.service.site import Site, UnknownName, read_site

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from optloc import InvalidProblem
 from optloc.cli import app
 from optloc.service.checkpoint import restore, state_of
-from optloc.service.events import Events, parse
+from optloc.service.events import Events
+from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.stream import Settings, Stream
 

@@ -20,7 +20,7 @@ from optloc.service.command import (
     seconds_of,
     wait,
 )
-from optloc.service.events import parse
+from optloc.service.messages import parse
 from optloc.service.site import FAST
 
 

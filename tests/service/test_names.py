@@ -5,7 +5,8 @@ import json
 import pytest
 from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
 
-from optloc.service.events import Events, parse
+from optloc.service.events import Events
+from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.site import FAST, UnknownName
 from optloc.service.sources import ChirpStack

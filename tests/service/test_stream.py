@@ -17,7 +17,8 @@ from optloc.cli import app
 from optloc.files import load
 from optloc.service.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
 from optloc.service.engine import PENDING, Engine
-from optloc.service.events import Events, parse
+from optloc.service.events import Events
+from optloc.service.messages import parse
 from optloc.service.metrics import COUNTS, Metrics
 from optloc.service.queues import WAITING, Ticket
 from optloc.service.site import FAST
