@@ -9,7 +9,7 @@ from optloc.files import Budget, access, json_of, read_text
 from optloc.problem import InvalidProblem
 from optloc.service.answers import Record
 from optloc.service.events import Event, Events
-from optloc.service.messages import name_under, picoseconds, rows_and_arrivals
+from optloc.service.messages import name_under, picoseconds, rows_and_arrivals, scoped_under
 from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 
@@ -61,7 +61,7 @@ def restore(path: Path, events: Events, now: float) -> None:
         raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)
     try:
-        closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
+        closed = [scoped_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
         counts = _counts(found.get("counts"))
         # Fill `opened` first, and change `events` only if the whole file is valid.
         taken, opened = set(closed), dict[str, Event]()
@@ -98,7 +98,7 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")
-    name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
+    name, target = scoped_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
         raise InvalidProblem(f"the event {name!r} occurs twice", "event", "remove one")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))

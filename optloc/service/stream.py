@@ -20,13 +20,14 @@ from optloc.engine import enabled, simulate
 from optloc.files import GrowingFile, access, write_text
 from optloc.problem import InvalidProblem
 from optloc.service import events as of_events
-from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
+from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_feed, to_line
 from optloc.service.checkpoint import restore, state_of
 from optloc.service.engine import BATCH, Engine
-from optloc.service.events import Events
-from optloc.service.messages import LINE, parse
+from optloc.service.events import Events, RefusedRepeat
+from optloc.service.messages import LINE, parse, shown_name, stamped
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
+from optloc.service.replies import Replies
 from optloc.service.site import Site, UnknownName, read_site
 from optloc.service.tracks import Following, Tracks
 
@@ -135,7 +136,10 @@ class Stream:
         self._outbox = Outbox(write, self.inbox.close)
         self._format = FORMATS[settings.format]
         self._engine = self._new_engine(site)
-        self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
+        self._replies = Replies()
+        self._events = Events(
+            site, self.metrics, self._emit, settings.wait, settings.revise, settings.part, attach=self._replies.attach
+        )
         self._unwritten: dict[str, of_events.Event] = {}  # closed events whose last answer may not be written yet
         # before other files are created, since a rejected checkpoint must leave none behind
         if settings.state is not None and settings.state.exists():
@@ -304,6 +308,8 @@ class Stream:
                     self._events.refuse(error, line.stamp, line.when, track=track)
                 counts["malformed"] += 1
                 refused = {"error": str(error), "line": line.number, "source": line.source}
+                if isinstance(error, RefusedRepeat):
+                    refused |= {**shown_name(error.name), "code": error.code}
                 if ticket is None:
                     self._emit(refused)
         if ticket is not None:
@@ -331,11 +337,9 @@ class Stream:
     def _answer(self, event: of_events.Event, record: Record, last: bool) -> None:
         """Write an answer of an event, and pass it to all receivers; `last` marks the last answer of the event."""
         self._publish(record)
-        self._outbox.put(self._format(record, self.site.frame) or b"", event.name if last else None)
-        if event.reply is not None:
-            event.reply.answer(record, last)
-            if last:
-                event.reply = None  # the event is remembered for long, but the client has its last answer
+        whole = self._replies.answer(event, record, last)
+        line = to_feed(self._settings.format, record, whole, self.site.frame, last=last)
+        self._outbox.put(line, event.name if last else None)
 
     def _emit(self, record: Record) -> None:
         """Write a record that is not an answer: a note, an error, health."""
@@ -385,7 +389,7 @@ class Stream:
     def _record_line(self, data: bytes, stamp: float) -> None:
         """Record a line with its time of reading, `stamp`, s, as the first key of its JSON object."""
         if self._record is not None:
-            self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
+            self._recorded += stamped(data, stamp) + b"\n"
             if len(self._recorded) > _RECORD_BUFFER:
                 self._write_record()
 
