@@ -244,7 +244,7 @@ def test_a_websocket_takes_lines_and_tells_all_answers(site, served):
 
 def test_a_websocket_that_reads_too_slowly_is_closed(served, monkeypatch):
     stream, port = served
-    monkeypatch.setattr("optloc.service.serve._QUEUE", 4)
+    monkeypatch.setattr("optloc.service.sockets._QUEUE", 4)
     with connect(f"ws://127.0.0.1:{port}/ws", open_timeout=10.0) as socket:
         socket.send("{}")
         socket.recv(timeout=10.0)
