@@ -62,6 +62,8 @@ class Event:
         Receiver of the answers.
     refused : str
         Error if a line has a station or a kind that the site does not have; the event is then not solved.
+    lines : dict of str to int
+        Number of its lines by source, which count as open until the event has its last answer.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Event:
     when: int | None = None
     track: bool = False
     refused: str = ""
+    lines: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -100,6 +103,8 @@ class Events:
         Number of this process and number of processes: each answers a share of the events.
     most : int
         Largest number of open events.
+    revision : int
+        Revision of the first answer of an event: 1, and one more for each start after a kill.
     """
 
     site: Site
@@ -109,6 +114,7 @@ class Events:
     revise: bool = False
     part: tuple[int, int] = (0, 1)
     most: int = MOST_OPEN
+    revision: int = 1
     open: dict[str, Event] = field(default_factory=dict)
     # None: an id from a checkpoint, without rows
     closed: dict[str, Event | None] = field(default_factory=dict)
@@ -118,8 +124,11 @@ class Events:
 
     def take(
         self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
-    ) -> None:
+    ) -> Event | str:
         """Add the rows of a line to its event, and close the event if it is whole.
+
+        Return the event that answers the line. Without such an event, return the state of the line in the account:
+        "answered" for rows that repeat an answered event, otherwise "dropped".
 
         `now` is the time of reading by the monotonic clock, s; `when` is the time of reading by the clock for which
         events wait, s. `reply` receives the answers unless the event already has a receiver. With `track`, a new event
@@ -131,18 +140,17 @@ class Events:
         counts["rows"] += size
         if self.part[1] > 1 and share_of(message.event, self.part[1]) != self.part[0]:
             counts["elsewhere"] += size
-            return
+            return "dropped"
         event = self.open.get(message.event)
         if event is None:
             if message.event in self.closed:
-                self._after(message, now)
-                return
+                return self._after(message, now)
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
-            event.when, event.track = message.when, track
+            event.when, event.track, event.revision = message.when, track, self.revision
             self._wait_for(event, reply)
             if message.whole:
                 self._close(event, "whole", now)
-                return
+                return event
             self._open(event, now)
         else:
             self._join(event, message)
@@ -150,6 +158,7 @@ class Events:
         if message.whole or self._is_whole(event):
             self.open.pop(event.name, None)
             self._close(event, "whole", now)
+        return event
 
     def refuse(self, error: UnknownName, now: float, when: float, *, track: bool = False) -> None:
         """Reject the event of a line with an unknown station or kind, if other lines also belong to the event.
@@ -164,7 +173,7 @@ class Events:
         if event is None:
             if error.whole or not error.event or error.event in self.closed:
                 return
-            event = Event(error.event, {}, {}, when, now, track=track)
+            event = Event(error.event, {}, {}, when, now, track=track, revision=self.revision)
             self._open(event, now)
         event.refused = event.refused or str(error)
         if error.whole:
@@ -260,12 +269,15 @@ class Events:
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
-    def _after(self, message: Message, now: float) -> None:
-        """Handle rows that arrive after the answer of their event: count them, send notes, or answer again."""
+    def _after(self, message: Message, now: float) -> Event | str:
+        """Handle rows that arrive after the answer of their event: count them, send notes, or answer again.
+
+        The result is as in `take`.
+        """
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:
             counts["repeated"] += len(message.rows) + len(message.times)
-            return
+            return "answered"
         site = self.site
         late = [site.name_of(key) for key in message.rows if key not in event.rows]
         late += [site.stations[i] for i in message.times if i not in event.times]
@@ -287,6 +299,8 @@ class Events:
             counts["revisions"] += 1
             self.closed[event.name] = again
             self.ready.append(again)
+            return again
+        return "dropped" if late or other else "answered"
 
 
 def share_of(event: str, count: int) -> int:
