@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, current_thread, main_thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -41,9 +41,9 @@ from optloc.problem import InvalidProblem, nearest
 from optloc.service.http_options import AccessRules, Hosts, Http, NoToken, Tokens, access_of, address_of
 
 if TYPE_CHECKING:
+    from optloc.service.adapters import Adapter
     from optloc.service.recording import Recorded
     from optloc.service.site import Site, SiteOptions
-    from optloc.service.sources import Adapter
     from optloc.service.stream import Stream
 
 # Import the stream inside the commands, so that --help prints without delay.
@@ -300,13 +300,14 @@ class ServiceOptions:
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal arrives, and return the exit code.
+    """Run a stream until its source ends or a signal arrives, and return the exit code, as in `wait`.
 
     `file` is the problem file of the site.
     """
+    from optloc.service.adapters import adapter_of
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
-    from optloc.service.sources import adapter_of
+    from optloc.service.standard_error import standard_error
     from optloc.service.stream import Settings, Stream
 
     if not options.speed > 0.0:
@@ -321,10 +322,11 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])
-    say = _silent if options.quiet else _say
     write = _write(sys.stdout.buffer) if options.stdout else _silent
-    with _threads(), ExitStack() as stops:
+    with _threads(), standard_error(quiet=options.quiet) as (say, messages), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
+        stream.watch_output(messages)
+        stops.callback(stream.sources.stop)
         stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
@@ -333,7 +335,10 @@ def run_live(file: Path, options: ServiceOptions) -> int:
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
-    say(json.dumps({"health": stream.health()}))
+        say(json.dumps({"health": stream.health()}))
+        failed = stream.sources.failed
+        if failed:
+            say(f"The stream ends with exit code {code}: {', '.join(failed)} failed.")
     return code
 
 
@@ -353,21 +358,27 @@ def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stop
         opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
     for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
         if address is not None:
-            stops.callback(begin(stream, address, adapter))
+            stream.start(begin(stream, address, adapter))
     return opened
 
 
 def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
-    from optloc.service.stream import read_lines
+    from optloc.service.sources import standard_input
+    from optloc.service.supervisor import Source, Watch
 
     if recording is not None:
-        lines = recording if adapter is None else [each._replace(data=adapter(each.data)) for each in recording]
-        _begin(lambda: replay(lines, stream, options.speed, str(options.recording)), stream)
+        name = str(options.recording)
+
+        def run(_: Watch) -> None:
+            """Read the recording."""
+            replay(recording, stream, options.speed, name, adapter)
+
+        stream.start(Source(name, run, is_last=True, tries=0))  # a second attempt would repeat the first lines
     elif options.stdin:
         read, pending = _reader(sys.stdin)
-        _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
+        stream.start(standard_input(stream, read, adapter, pending))
 
 
 def site_options(
@@ -413,17 +424,24 @@ def input_description(site: Site) -> Iterator[str]:
     )
 
 
+SOURCE_FAILED = 3
+"""Exit code of a stream that ends while one of its sources does not work."""
+
+
 def wait(stream: Stream, interrupted: Event) -> int:
     """Wait for the end of a stream and return its exit code; raise the error that ended the stream, if any.
 
-    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, 0 otherwise.
+    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, `SOURCE_FAILED`
+    if a source does not work, and 0 otherwise.
     """
     # on Windows, a wait without a timeout blocks signals
     while not stream.ended.wait(1.0):
         pass
     if stream.error is not None:
         raise stream.error
-    return STOPPED if interrupted.is_set() else READER_GONE if stream.failed else 0
+    if interrupted.is_set() or stream.failed:
+        return STOPPED if interrupted.is_set() else READER_GONE
+    return SOURCE_FAILED if stream.sources.failed else 0
 
 
 @contextmanager
@@ -482,19 +500,6 @@ def _threads() -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _begin(source: Callable[[], None], stream: Stream) -> None:
-    """Read a source in a separate thread, and close the stream at its end."""
-
-    def run() -> None:
-        """Read the source, then close the stream, also after an error."""
-        try:
-            source()
-        finally:
-            stream.close()
-
-    Thread(target=run, name="optloc input", daemon=True).start()
-
-
 def _write(file: Any) -> Callable[[bytes], None]:
     """Return a function that writes bytes to a binary file at once, without a buffer that delays answers."""
 
@@ -524,12 +529,15 @@ def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
         except (OSError, ValueError):
             return False  # on Windows, select works for sockets only
 
-    return lambda count: os.read(descriptor, count), pending
+    def read(count: int) -> bytes:
+        """Return at most `count` available bytes; wait for the first byte."""
+        while True:
+            try:
+                return os.read(descriptor, count)
+            except BlockingIOError:  # the writer of the pipe has set the mode that never waits
+                select.select([descriptor], [], [])
 
-
-def _say(line: str) -> None:
-    """Print a line for people to standard error."""
-    typer.echo(visible(line), err=True)
+    return read, pending
 
 
 def _silent(_: str | bytes) -> None:

@@ -83,6 +83,8 @@ class Event:
         Whether the event has its last answer.
     refused : str
         Error if a line has a station or a kind that the site does not have; the event is then not solved.
+    lines : dict of str to int
+        Number of its lines by source, which count as open until the event has its last answer.
     """
 
     name: str
@@ -101,6 +103,7 @@ class Event:
     when: int | None = None
     track: bool = False
     refused: str = ""
+    lines: dict[str, int] = field(default_factory=dict)
 
 
 def _attach(event: Event, reply: Reply) -> bool:
@@ -133,6 +136,8 @@ class Events:
         Largest number of open events.
     attach : callable
         Gives a receiver the answers of an event; returns False if they are gone. See `optloc.service.replies`.
+    revision : int
+        Revision of the first answer of an event: 1, and one more for each start after a kill.
     """
 
     site: Site
@@ -143,6 +148,7 @@ class Events:
     part: tuple[int, int] = (0, 1)
     most: int = MOST_OPEN
     attach: Callable[[Event, Reply], bool] = _attach
+    revision: int = 1
     open: dict[str, Event] = field(default_factory=dict)
     # None: an id from a checkpoint, without rows
     closed: dict[str, Event | None] = field(default_factory=dict)
@@ -152,8 +158,11 @@ class Events:
 
     def take(
         self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
-    ) -> None:
+    ) -> Event | str:
         """Add the rows of a line to its event, and close the event if it is whole.
+
+        Return the event that answers the line. Without such an event, return the state of the line in the account:
+        "answered" for rows that repeat an answered event, otherwise "dropped".
 
         `now` is the time of reading by the monotonic clock, s; `when` is the time of reading by the clock for which
         events wait, s. `reply` receives the answers. With `track`, a new event is answered by the state of its track.
@@ -165,18 +174,17 @@ class Events:
         counts["rows"] += size
         if self.part[1] > 1 and share_of(message.event, self.part[1]) != self.part[0]:
             counts["elsewhere"] += size
-            return
+            return "dropped"
         event = self.open.get(message.event)
         if event is None:
             if message.event in self.closed:
-                self._after(message, now, reply, track=track)
-                return
+                return self._after(message, now, reply, track=track)
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
-            event.when, event.track = message.when, track
+            event.when, event.track, event.revision = message.when, track, self.revision
             self._wait_for(event, reply)
             if message.whole:
                 self._close(event, "whole", now)
-                return
+                return event
             self._open(event, now)
         else:
             if reply is not None:
@@ -186,6 +194,7 @@ class Events:
         if message.whole or self._is_whole(event):
             self.open.pop(event.name, None)
             self._close(event, "whole", now)
+        return event
 
     def refuse(self, error: UnknownName, now: float, when: float, *, track: bool = False) -> None:
         """Reject the event of a line with an unknown station or kind, if other lines also belong to the event.
@@ -200,7 +209,7 @@ class Events:
         if event is None:
             if error.whole or not error.event or error.event in self.closed:
                 return
-            event = Event(error.event, {}, {}, when, now, track=track)
+            event = Event(error.event, {}, {}, when, now, track=track, revision=self.revision)
             self._open(event, now)
         event.refused = event.refused or str(error)
         if error.whole:
@@ -318,17 +327,18 @@ class Events:
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
-    def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> None:
+    def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
         """Handle rows that arrive after their event has closed: count them, send notes, or answer again.
 
-        A receiver gets the answer of the event; a line with other rows or values is refused, as in `take`.
+        A receiver gets the answer of the event; a line with other rows or values is refused. The result is as in
+        `take`.
         """
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:
             counts["repeated"] += len(message.rows) + len(message.times)
             if reply is not None:
                 raise RefusedRepeat("its answer is no longer kept", message.event, GONE)
-            return
+            return "answered"
         if reply is not None:
             self._refuse_other(event, message, track=track)
         site = self.site
@@ -354,8 +364,10 @@ class Events:
             counts["revisions"] += 1
             self.closed[event.name] = again
             self.ready.append(again)
-            event = again
+            self._wait_for(again, reply)
+            return again
         self._wait_for(event, reply)
+        return "dropped" if late or other else "answered"
 
 
 def share_of(event: str, count: int) -> int:

@@ -9,7 +9,8 @@ import numpy as np
 
 from optloc.problem.build import Problem
 from optloc.service.site import read_site
-from optloc.service.stream import Settings, Stream, read_lines
+from optloc.service.sources import read_lines
+from optloc.service.stream import Settings, Stream
 from optloc.solvers import solve
 
 C = 299_792_458.0
