@@ -117,15 +117,15 @@ def protocol_of(connections: Connections, head: float = HEAD, whole: float = WHO
             return cycle is None or bool(cycle.response_complete)
 
         def check(self) -> None:
-            """Close the connection if its time is over, or look again at the end of its time."""
-            silent = self.is_silent
-            left = self.since + (head if silent else whole) - self.loop.time()
+            """Close the connection if its time is over, or look again at the end of its time.
+
+            The client sent too little of a request, sends a body too slowly, or reads its answer too slowly.
+            """
+            left = self.since + (head if self.is_silent else whole) - self.loop.time()
             if left > 0.0:
                 self.timer = self.loop.call_later(left, self.check)
-            elif silent:
-                self.refuse(b"408 Request Timeout", b"the request is not complete")
             else:
-                self.drop()  # the client sends its body or reads its answer too slowly
+                self.drop()
 
         def handle_events(self) -> None:
             """Handle the data of the client; a new request begins a new time limit."""

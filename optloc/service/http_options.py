@@ -72,19 +72,18 @@ def access_of(hosts: Iterable[str], token_file: Path | None, *, without_token: b
 
     Raise InvalidProblem for an invalid host name, for a file without valid tokens, or for both token options.
     """
-    names = tuple(host.lower() for host in hosts)
-    for name in names:
+    given = tuple(host.lower() for host in hosts)
+    for name in given:
         if not _is_host(name):
             raise InvalidProblem(f"{name[:40]!r} is not a host name", "--allow-host", "write fixes.example.org")
     if token_file is not None and without_token:
         raise InvalidProblem("a token is required and not required", "--no-token", "remove this option")
-    return AccessRules(names, () if token_file is None else tokens_in(token_file), without_token)
+    return AccessRules(tuple(map(hostname, given)), () if token_file is None else tokens_in(token_file), without_token)
 
 
 def _is_host(name: str) -> bool:
-    """Return whether a text is a host name or an address, without a port, a path or a user."""
-    port = ":" in name.rpartition("]")[2]
-    return name != "" and hostname(name) == name.strip("[]") and not port and not set(name) & set("/@?# ")
+    """Return whether a text is a host name or an address, without a port."""
+    return name != "" and hostname(name) == name.strip("[]") and " " not in name
 
 
 def tokens_in(path: Path) -> tuple[bytes, ...]:
@@ -106,9 +105,10 @@ def tokens_in(path: Path) -> tuple[bytes, ...]:
 def hostname(given: str) -> str:
     """Return the host name of a header in lower case, without port and brackets; empty for an invalid header."""
     try:
-        return urlsplit(f"//{given}").hostname or ""
+        found = urlsplit(f"//{given}")
     except ValueError:
         return ""
+    return (found.hostname or "") if found.netloc == given and "@" not in given else ""
 
 
 def digest_of(token: str) -> bytes:

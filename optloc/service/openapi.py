@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
+from optloc.service.events import GONE, OTHER
 from optloc.service.messages import COMMANDS, NAME, ROWS
 from optloc.service.site import Site
 
@@ -185,13 +186,15 @@ def _operation(endpoint: Endpoint) -> dict[str, Any]:
     name = f"{endpoint.method.lower()}{endpoint.path.translate(str.maketrans('/.{}', '____'))}".rstrip("_")
     # A body with one record in each line is text for a schema.
     answers = {kind: {"schema": {"type": "string"} if kind == LINES else schema} for kind in endpoint.media}
-    error = {JSON: {"schema": {"$ref": "#/components/schemas/Error"}}}
+    error: dict[str, Any] = {JSON: {"schema": {"$ref": "#/components/schemas/Error"}}}
+    # a request whose lines are all refused has one record for each line
+    errors = error | ({LINES: {"schema": {"type": "string"}}} if endpoint.lines else {})
     found: dict[str, Any] = {
         "operationId": name,
         "summary": endpoint.about,
         "responses": {"200": {"description": "the answer", "content": answers}}
         | {
-            str(code): {"description": REFUSALS[code], "content": error}
+            str(code): {"description": REFUSALS[code], "content": errors if code in (OTHER, GONE) else error}
             for code in sorted({*_ALWAYS, *endpoint.refusals})
         },
     }

@@ -1,12 +1,12 @@
 """A stream over HTTP: requests, limits, strangers' pages, the websocket, the map."""
 
-import http.client
 import json
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from service.lines import SITE, Answers, arrivals, differences, line, site_in, solved
+from service.conftest import ON_EARTH
+from service.lines import Answers, arrivals, ask, differences, line, solved
 from show.browser import Browser, executable, readable
 
 pytest.importorskip("starlette")
@@ -22,34 +22,15 @@ from optloc.service.stream import Settings, Stream  # noqa: E402
 from optloc.service.tracks import Following  # noqa: E402
 from optloc.tracking import polynomial, tracked  # noqa: E402
 
-ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
+
+@pytest.fixture(scope="module")
+def site(on_earth):
+    return on_earth
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    return site_in(tmp_path_factory.mktemp("site"), ON_EARTH)
-
-
-@pytest.fixture(scope="module")
-def served(site):
-    """Return a stream that listens, and its port."""
-    stream = Stream(site, Settings(wait=0.05), Answers())
-    port, stop = serve(stream, port=0)
-    yield stream, port
-    stream.close()
-    assert stream.ended.wait(10.0)
-    stop()
-
-
-def ask(port, method, path, body=None, **headers):
-    """Return code, headers and text of an answer; names of headers have underscores here."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
-    given = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, given)
-    answer = connection.getresponse()
-    found = answer.status, dict(answer.getheaders()), answer.read().decode()
-    connection.close()
-    return found
+def served(server):
+    return server
 
 
 def test_a_request_is_answered_with_its_fix_and_proof(site, served):
