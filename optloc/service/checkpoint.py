@@ -12,7 +12,7 @@ from optloc.problem import InvalidProblem
 from optloc.service.account import SETTLED, STATES, total
 from optloc.service.answers import Record
 from optloc.service.events import Event, Events
-from optloc.service.messages import name_under, picoseconds, rows_and_arrivals
+from optloc.service.messages import name_under, picoseconds, rows_and_arrivals, scoped_under
 from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 
@@ -76,7 +76,7 @@ def restore(path: Path, events: Events, now: float) -> None:
         raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)
     try:
-        closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
+        closed = [scoped_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
         counts, account = _counts(found.get("counts")), _account(found.get("account", {}))
         ended = _typed(found.get("ended", False), bool, "ended")
         revision = _count(found.get("revision", 1), "revision") + (not ended)
@@ -119,7 +119,7 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")
-    name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
+    name, target = scoped_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
         raise InvalidProblem(f"the event {name!r} occurs twice", "event", "remove one")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))

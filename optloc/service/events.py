@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 from zlib import crc32
 
-from optloc.service.messages import Key, Message
+from optloc.problem import InvalidProblem
+from optloc.service.messages import Key, Message, shown_name
 from optloc.service.metrics import Metrics
 from optloc.service.site import Site, UnknownName
 
@@ -22,6 +23,22 @@ MOST_OPEN = 4096
 
 REMEMBERED = 65_536
 """Number of closed events whose rows are stored: a minute at a thousand events a second."""
+
+
+OTHER, GONE = 409, 410
+"""HTTP status codes of a repeated id: with other values, and with an answer that is no longer kept."""
+
+
+class RefusedRepeat(InvalidProblem):
+    """A request repeats the id of an event, but cannot have its answer.
+
+    `name` is the name of the event, and `code` is `OTHER` or `GONE`.
+    """
+
+    def __init__(self, what: str, name: str, code: int) -> None:
+        advice = {OTHER: "use another id, or name the client", GONE: "use another id"}[code]
+        super().__init__(what, f"event {shown_name(name)['event'][:40]!r}", advice)
+        self.name, self.code = name, code
 
 
 class Reply(Protocol):
@@ -41,7 +58,7 @@ class Event:
     Parameters
     ----------
     name : str
-        Id of the event.
+        Id of the event, as in `optloc.service.messages.scoped`.
     rows, times, sigmas, target
         As in `Message`.
     first : float
@@ -58,8 +75,12 @@ class Event:
         As in `Message`.
     track : bool
         Whether the answer is the state of a track instead of a fix.
-    reply : Reply, optional
-        Receiver of the answers.
+    replies : list of Reply
+        Receivers of the answers.
+    so_far : dict, optional
+        Answers so far, as one record; None without any, and after the last.
+    answered : bool
+        Whether the event has its last answer.
     refused : str
         Error if a line has a station or a kind that the site does not have; the event is then not solved.
     lines : dict of str to int
@@ -76,11 +97,21 @@ class Event:
     closed: str = ""
     revision: int = 1
     conflict: bool = False
-    reply: Reply | None = None
+    replies: list[Reply] = field(default_factory=list)
+    so_far: dict[str, Any] | None = None
+    answered: bool = False
     when: int | None = None
     track: bool = False
     refused: str = ""
     lines: dict[str, int] = field(default_factory=dict)
+
+
+def _attach(event: Event, reply: Reply) -> bool:
+    """Give a receiver the answers of an event that is not answered, and return whether it is not answered."""
+    if not event.answered and reply not in event.replies:
+        event.replies.append(reply)
+        reply.expect()
+    return not event.answered
 
 
 @dataclass(slots=True)
@@ -103,6 +134,8 @@ class Events:
         Number of this process and number of processes: each answers a share of the events.
     most : int
         Largest number of open events.
+    attach : callable
+        Gives a receiver the answers of an event; returns False if they are gone. See `optloc.service.replies`.
     revision : int
         Revision of the first answer of an event: 1, and one more for each start after a kill.
     """
@@ -114,6 +147,7 @@ class Events:
     revise: bool = False
     part: tuple[int, int] = (0, 1)
     most: int = MOST_OPEN
+    attach: Callable[[Event, Reply], bool] = _attach
     revision: int = 1
     open: dict[str, Event] = field(default_factory=dict)
     # None: an id from a checkpoint, without rows
@@ -131,9 +165,9 @@ class Events:
         "answered" for rows that repeat an answered event, otherwise "dropped".
 
         `now` is the time of reading by the monotonic clock, s; `when` is the time of reading by the clock for which
-        events wait, s. `reply` receives the answers unless the event already has a receiver. With `track`, a new event
-        is answered by the state of its track. If another process answers the event, the rows are only counted. If the
-        event is already closed, the rows are late or repeated.
+        events wait, s. `reply` receives the answers. With `track`, a new event is answered by the state of its track.
+        If another process answers the event, the rows are only counted. If the event is already closed, the rows are
+        late or repeated. Raise RefusedRepeat for a line with a receiver that differs from the event of its id.
         """
         counts = self.metrics.counts
         size = len(message.rows) + len(message.times)
@@ -144,7 +178,7 @@ class Events:
         event = self.open.get(message.event)
         if event is None:
             if message.event in self.closed:
-                return self._after(message, now)
+                return self._after(message, now, reply, track=track)
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
             event.when, event.track, event.revision = message.when, track, self.revision
             self._wait_for(event, reply)
@@ -153,6 +187,8 @@ class Events:
                 return event
             self._open(event, now)
         else:
+            if reply is not None:
+                self._refuse_other(event, message, track=track)
             self._join(event, message)
             self._wait_for(event, reply)
         if message.whole or self._is_whole(event):
@@ -247,10 +283,32 @@ class Events:
         return len(event.rows) >= len(site.rows) and all(i in event.rows for i in range(len(site.rows)))
 
     def _wait_for(self, event: Event, reply: Reply | None) -> None:
-        """Give the event a receiver of its answers, if it has none."""
-        if reply is not None and event.reply is None:
-            event.reply = reply
-            reply.expect()
+        """Give the event a receiver of its answers, if there is one; raise RefusedRepeat if its answer is gone."""
+        if reply is not None and not self.attach(event, reply):
+            raise RefusedRepeat("its answer is no longer kept", event.name, GONE)
+
+    def _refuse_other(self, event: Event, message: Message, *, track: bool) -> None:
+        """Raise RefusedRepeat if a line has other values than the event of its id."""
+        other = self._differing(event, message)
+        self.metrics.counts["conflicts"] += len(other)
+        for key in ("target", "when"):
+            given = getattr(message, key)
+            if given not in ("", None) and given != getattr(event, key):
+                other.append({"target": "its target", "when": "its time"}[key])
+        sigmas = message.sigmas or {}
+        if any(event.sigmas.get(key) != sigma for key, sigma in sigmas.items() if key in event.rows):
+            other.append("its sigma")
+        if event.track != track:
+            other.append("its form, fix or track")
+        if other:
+            more = f" and {len(other) - 3} more" if len(other) > 3 else ""
+            raise RefusedRepeat(f"the id is used with other values: {', '.join(other[:3])}{more}", event.name, OTHER)
+
+    def _differing(self, event: Event, message: Message) -> list[str]:
+        """Return the names of the rows and stations of a line that have another value in the event."""
+        site = self.site
+        other = [site.name_of(key) for key, value in message.rows.items() if event.rows.get(key, value) != value]
+        return other + [site.stations[i] for i, value in message.times.items() if event.times.get(i, value) != value]
 
     def _close(self, event: Event, why: str, now: float) -> None:
         """Close an event for the reason `why`, and queue it for its answer."""
@@ -269,37 +327,45 @@ class Events:
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
-    def _after(self, message: Message, now: float) -> Event | str:
-        """Handle rows that arrive after the answer of their event: count them, send notes, or answer again.
+    def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
+        """Handle rows that arrive after their event has closed: count them, send notes, or answer again.
 
-        The result is as in `take`.
+        A receiver gets the answer of the event; a line with other rows or values is refused. The result is as in `take`.
         """
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:
             counts["repeated"] += len(message.rows) + len(message.times)
+            if reply is not None:
+                raise RefusedRepeat("its answer is no longer kept", message.event, GONE)
             return "answered"
+        if reply is not None:
+            self._refuse_other(event, message, track=track)
         site = self.site
         late = [site.name_of(key) for key in message.rows if key not in event.rows]
         late += [site.stations[i] for i in message.times if i not in event.times]
-        other = [site.name_of(key) for key, value in message.rows.items() if event.rows.get(key, value) != value]
-        other += [site.stations[i] for i, value in message.times.items() if event.times.get(i, value) != value]
+        other = self._differing(event, message)
         counts["conflicts"] += len(other)
         counts["repeated"] += len(message.rows) + len(message.times) - len(late) - len(other)
         counts["late"] += len(late)
         if other:
-            self.note({"event": event.name, "note": "conflict", "rows": other})
+            self.note({**shown_name(event.name), "note": "conflict", "rows": other})
         if late and not self.revise:
-            self.note({"event": event.name, "note": "late", "rows": late})
+            self.note({**shown_name(event.name), "note": "late", "rows": late})
+            if reply is not None:
+                raise RefusedRepeat(f"it is answered without {', '.join(late[:3])}", event.name, OTHER)
         if late and self.revise:
             again = Event(
                 event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
                 {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
-                "late", event.revision + 1, event.conflict or bool(other), None, event.when, event.track, event.refused,
+                "late", event.revision + 1, event.conflict or bool(other), when=event.when, track=event.track,
+                refused=event.refused,
             )  # fmt: skip
             counts["revisions"] += 1
             self.closed[event.name] = again
             self.ready.append(again)
+            self._wait_for(again, reply)
             return again
+        self._wait_for(event, reply)
         return "dropped" if late or other else "answered"
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from optloc.files import has_controls
 from optloc.problem import LARGEST, InvalidProblem, nearest, no_station
 from optloc.service.site import Site, SiteRow, UnknownName
+from optloc.service.strict_json import read_object
 
 LINE = 1 << 16
 """Largest size of a line, bytes: more than a thousand rows."""
@@ -19,26 +20,19 @@ COMMANDS = ("flush", "health")
 _NAME, _ROWS = 256, 4096
 _KEYS = {
     *("command", "event", "z", "rows", "arrivals", "station", "kind", "a", "b", "sigma", "more", "target", "received"),
-    *("time", "time_ns", "time_ps"),
+    *("time", "time_ns", "time_ps", "client"),
 }
 _ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
 # Decimals that give picoseconds, by the key of a time.
 _DIGITS = {"time": 12, "time_ns": 3, "time_ps": 0}
 _DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
+# Tabs and line breaks, which are control characters that other texts may have.
+_BREAKS = re.compile(r"[\t\n\r]")
 # Picoseconds of 30 000 years: no clock has a later time.
 _LATEST = 10**24
 
 Key = int | SiteRow
 """A row of an event: its number in the template, or a row that is not in the template."""
-
-
-def _refuse(word: str) -> Any:
-    """Raise ValueError for a constant that JSON does not permit, such as NaN."""
-    raise ValueError(f"{word} is not a number")
-
-
-# Reject NaN and infinity, which are not JSON, during parsing.
-_JSON = json.JSONDecoder(parse_constant=_refuse)
 
 
 class Message(NamedTuple):
@@ -47,7 +41,7 @@ class Message(NamedTuple):
     Parameters
     ----------
     event : str
-        Event of the rows; empty for a command.
+        Event of the rows, as in `scoped`; empty for a command.
     rows : dict of Key to float
         Values in the units of the site.
     times : dict of int to int
@@ -82,17 +76,7 @@ def parse(line: bytes, site: Site) -> Message:
     InvalidProblem
         For an invalid line; the message names the key. `UnknownName` has the event of the line.
     """
-    if len(line) > LINE:
-        raise InvalidProblem(f"the line has {len(line)} bytes, more than {LINE}", None, "send fewer rows in a line")
-    try:
-        found = _JSON.decode(line.decode())
-    except RecursionError:
-        raise InvalidProblem("the line is nested too deeply", None, "send one flat object in each line") from None
-    except ValueError as error:
-        what = "it is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error).partition(":")[0].lower()
-        raise InvalidProblem(f"this is not JSON: {what}", None, "send one object in each line") from None
-    if type(found) is not dict:
-        raise InvalidProblem("this is not a JSON object", None, 'send {"event": "1", "z": [...]}')
+    found = read_object(line, LINE)
     z = found.get("z")
     if len(found) == 2 and type(z) is list:
         return Message(_event(found), _values(z, site), {}, whole=True)  # the most frequent form of values
@@ -115,7 +99,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         if command not in COMMANDS:
             raise InvalidProblem(f"unknown command {str(command)[:40]!r}", "command", f"use {' or '.join(COMMANDS)}")
         return Message("", {}, {}, whole=False, command=command)
-    event = _event(found)
+    event = scoped(_text(found["client"], "client") if "client" in found else "", _event(found))
     target = _text(found["target"], "target") if "target" in found else ""
     forms: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
     forms += ["z"] if "z" in found and "kind" not in found else []
@@ -131,6 +115,29 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         error.event, error.whole = event, not more
         raise
     return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, forms))
+
+
+def stamped(data: bytes, received: float) -> bytes:
+    """Return a valid line with its time of reading, s, as the first key: the form of a recording."""
+    if b'"received"' in data:  # a line of a recording that is read again
+        found = read_object(data, LINE)
+        found.pop("received", None)
+        data = json.dumps(found).encode()
+    return b'{"received":%.6f,' % received + data[1:]
+
+
+# Clients may use the same ids. A line feed joins client and id, because no name may contain one.
+
+
+def scoped(client: str, event: str) -> str:
+    """Return the name of an event of a client within a stream; the id itself without a client."""
+    return f"{client}\n{event}" if client else event
+
+
+def shown_name(name: str) -> dict[str, str]:
+    """Return the keys of an event for answers: its id, and its client if it has one."""
+    client, _, event = name.rpartition("\n")
+    return {"event": event, "client": client} if client else {"event": event}
 
 
 def _named(
@@ -167,7 +174,7 @@ def _event(found: Mapping[str, Any]) -> str:
 
 def _text(given: Any, key: str) -> str:
     """Return a name under `key`; raise InvalidProblem for other values, such as text with control characters."""
-    if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
+    if type(given) is not str or not given or len(given) > _NAME or _BREAKS.search(given) or has_controls(given):
         raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {_NAME} printable characters")
     return given
 
@@ -281,6 +288,14 @@ def rows_and_arrivals(
 
 def name_under(key: str, given: Any) -> str:
     """Return the name under a key; raise InvalidProblem for an invalid name."""
+    return _text(given, key)
+
+
+def scoped_under(key: str, given: Any) -> str:
+    """Return the name of an event under a key, as `scoped` returns it; raise InvalidProblem for an invalid name."""
+    parts = given.split("\n") if type(given) is str else [given]
+    if len(parts) == 2:
+        return scoped(_text(parts[0], key), _text(parts[1], key))
     return _text(given, key)
 
 

@@ -28,7 +28,7 @@ class Ticket:
 
     def __init__(self, lines: int, done: Callable[[list[Record]], None]) -> None:
         self._lock, self._lines, self._done = Lock(), lines, done
-        self._open, self._records = 0, dict[int | str, Record]()
+        self._open, self._records = 0, dict[int | tuple[str, str], Record]()
 
     def expect(self) -> None:
         """Register one more event of these lines to be answered."""
@@ -48,7 +48,7 @@ class Ticket:
     def answer(self, record: Record, last: bool) -> None:
         """Take an answer; both phases of an event are joined to one record."""
         with self._lock:
-            name = record["event"]
+            name = record.get("client", ""), record["event"]
             self._records[name] = join(self._records.get(name), record)
             self._open -= last
             over = last and self._lines == 0 and self._open == 0

@@ -20,17 +20,18 @@ from optloc.files import access
 from optloc.service.account import total
 from optloc.service.adapters import Adapter, converted
 from optloc.service.alarms import Alarm, SourceLost, sentence
-from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
+from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_feed, to_line
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import BATCH, Engine, warm_up
-from optloc.service.events import Event, Events
-from optloc.service.messages import parse
+from optloc.service.events import Event, Events, RefusedRepeat
+from optloc.service.messages import parse, shown_name
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
+from optloc.service.replies import Replies
 from optloc.service.side_outputs import SideOutput
 from optloc.service.site import Site, UnknownName, read_site
 from optloc.service.stream_files import StreamFiles
-from optloc.service.supervisor import Source, Supervisor, Watch
+from optloc.service.supervisor import LineSource, Supervisor, Watch
 from optloc.service.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.service")
@@ -139,7 +140,10 @@ class Stream:
         self._outbox = Outbox(write, self.inbox.close, self._settle)
         self._format = FORMATS[settings.format]
         self._engine = self._new_engine(site)
-        self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
+        self._replies = Replies()
+        self._events = Events(
+            site, self.metrics, self._emit, settings.wait, settings.revise, settings.part, attach=self._replies.attach
+        )
         # closed events whose last answer may not be written yet, by identity, since an event may be answered twice
         self._unsettled: dict[int, Event] = {}
         self._settling = Lock()
@@ -197,7 +201,7 @@ class Stream:
         found = [(i, *converted(adapter, each)) for i, each in enumerate(data, first) if ticket or each.strip()]
         return [QueuedLine(each, i, source, now, when, ticket, track, fault) for i, each, fault in found]
 
-    def start(self, source: Source) -> None:
+    def start(self, source: LineSource) -> None:
         """Read a source in a separate thread, and again after an error."""
         self.sources.start(source)
 
@@ -359,6 +363,8 @@ class Stream:
             self._events.refuse(error, line.stamp, line.when, track=track)
         self.metrics.counts["malformed"] += 1
         refused = {"error": sentence(error), "line": line.number, "source": line.source}
+        if isinstance(error, RefusedRepeat):
+            refused |= {**shown_name(error.name), "code": error.code}
         if line.ticket is None:
             self._emit(refused)
         return refused
@@ -385,16 +391,13 @@ class Stream:
     def _answer(self, event: Event, record: Record, last: bool) -> None:
         """Write an answer of an event, and pass it to all receivers; `last` marks the last answer of the event."""
         self._publish(record)
-        self._outbox.put(self._written(record), event if last else None)
-        if event.reply is not None:
-            event.reply.answer(record, last)
-            if last:
-                event.reply = None  # the event is remembered for long, but the client has its last answer
+        whole = self._replies.answer(event, record, last)
+        self._outbox.put(self._written(record, whole, last=last), event if last else None)
 
-    def _written(self, record: Record) -> bytes:
-        """Return an answer in the output format; if the format fails, return the error as an answer."""
+    def _written(self, record: Record, whole: Record, *, last: bool) -> bytes:
+        """Return an answer in the output format, as `to_feed`; if the format fails, return the error as an answer."""
         try:
-            return self._format(record, self.site.frame) or b""
+            return to_feed(self._settings.format, record, whole, self.site.frame, last=last)
         except Exception as error:  # an answer that cannot be written must not end the thread that made it
             LOG.debug("an answer cannot be written", exc_info=error)
             self.metrics.add("unwritable")

@@ -7,7 +7,7 @@ import pytest
 from service.lines import line, site_in
 
 from optloc.base.errors import InvalidProblem
-from optloc.service.messages import LINE, parse, picoseconds
+from optloc.service.messages import LINE, parse, picoseconds, scoped, scoped_under, shown_name, stamped
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +21,11 @@ def site(tmp_path_factory):
         (b"", "this is not JSON"),
         (b"[1]", "not a JSON object"),
         (b'{"event": 1', "this is not JSON"),
-        (b'{"event": "1", "z": [NaN, 0, 0, 0, 0]}', "this is not JSON: nan is not a number"),
+        (b'{"event": "1", "z": [NaN, 0, 0, 0, 0]}', "this is not JSON: NaN is not a number"),
         (b'{"event": "1", "z": [1e400, 0, 0, 0, 0]}', "z: inf is not a number"),
         (b'{"event": "1", "z": [true, 0, 0, 0, 0]}', "z: True is not a number"),
-        (b'{"event": "1", "z": [1' + b"0" * 400 + b", 0, 0, 0, 0]}", "is not a number up to"),
+        (b'{"event": "1", "z": [1' + b"0" * 400 + b", 0, 0, 0, 0]}", "a whole number has 401 digits, more than 100"),
+        (b'{"event": "1", "z": [1' + b"0" * 80 + b", 0, 0, 0, 0]}", "is not a number up to"),
         (b'{"event": "1", "z": [0]}', "there are 1 values, but the site has 5 rows"),
         (b'{"event": "1", "z": []}', "there are 0 values"),
         (b'{"event": "1"}', "the line has no rows"),
@@ -49,6 +50,14 @@ def site(tmp_path_factory):
         (b'{"command": "stop"}', "unknown command 'stop'"),
         (b'{"event": "1", "z": [0, 0, 0, 0, 0], "more": 1}', "neither true nor false"),
         (b"[" * 60_000, "nested too deep"),
+        (b'{"event": ' + b"[" * 16 + b"]" * 16 + b"}", "nested too deep"),
+        (b'{"event": "1", "event": "2", "z": [0, 0, 0, 0, 0]}', "this is not JSON: the key 'event' occurs twice"),
+        (b'{"event": "1", "rows": [{"z": 1, "z": 2}]}', "the key 'z' occurs twice"),
+        (b'{"event": "\\ud800", "z": [0, 0, 0, 0, 0]}', "half of a surrogate pair"),
+        (b'{"event": "1", "target": "\\udc00\\ud83d", "z": [0, 0, 0, 0, 0]}', "half of a surrogate pair"),
+        (b'{"event": "1", "z": [Infinity, 0, 0, 0, 0]}', "Infinity is not a number"),
+        (b'{"event": "1", "client": "", "z": [0, 0, 0, 0, 0]}', "client: '' is not a name"),
+        (b'{"event": "1", "client": "a\\nb", "z": [0, 0, 0, 0, 0]}', "is not a name"),
         (b"{" + b" " * LINE + b"}", "bytes, more than 65536"),
         (b'{"event": "\xff", "z": [0, 0, 0, 0, 0]}', "it is not UTF-8"),
     ],
@@ -66,6 +75,25 @@ def test_times_are_exact():
     assert picoseconds("1700000000.123456789012", "time") == 1_700_000_000_123_456_789_012
     assert picoseconds("-0.5", "time") == -(5 * 10**11)
     assert picoseconds(7, "time_ps") == picoseconds("7", "time_ps") == picoseconds("7.9", "time_ps") == 7
+
+
+def test_pairs_of_surrogates_are_characters(site):
+    assert parse(b'{"event": "\\ud83d\\ude80", "z": [0, 0, 0, 0, 0]}', site).event == "\N{ROCKET}"
+
+
+def test_ids_belong_to_their_client(site):
+    own = parse(line(event="1", client="roof", z=[0.0] * 5), site).event
+    assert own == scoped("roof", "1") != parse(line(event="1", z=[0.0] * 5), site).event
+    assert shown_name(own) == {"event": "1", "client": "roof"}
+    assert scoped_under("event", own) == own
+    for name in ("a\nb\nc", "\nb", "a\n"):
+        with pytest.raises(InvalidProblem, match="is not a name"):
+            scoped_under("event", name)
+
+
+def test_a_line_is_recorded_with_one_time_of_reading():
+    assert stamped(b'{"event":"1"}', 2.0) == b'{"received":2.000000,"event":"1"}'
+    assert json.loads(stamped(b'{"event":"1","received":1}', 2.0)) == {"received": 2.0, "event": "1"}
 
 
 def test_an_id_may_be_a_number_and_is_told_as_text(site):

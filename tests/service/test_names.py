@@ -5,12 +5,12 @@ import json
 import pytest
 from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
 
+from optloc.service.adapters import ChirpStack
+from optloc.service.checkpoint import restore, state_of
 from optloc.service.events import Events
 from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.site import FAST, UnknownName
-from optloc.service.adapters import ChirpStack
-from optloc.service.checkpoint import restore, state_of
 from optloc.service.sources import read_lines
 from optloc.service.stream import Settings, Stream
 

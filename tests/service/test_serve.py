@@ -74,8 +74,7 @@ def test_rows_of_one_event_may_come_in_several_requests(site, served):
     parts = [line(event="parts", station=name, time_ps=t) for name, t in zip("ABCDEF", times, strict=True)]
     code, _, said = ask(port, "POST", "/fix", b"\n".join(parts))
     assert (code, json.loads(said)["dof"]) == (200, 2)
-    code, _, said = ask(port, "POST", "/fix", parts[0])
-    assert (code, json.loads(said)) == (200, {"accepted": 1})
+    assert ask(port, "POST", "/fix", parts[0])[::2] == (200, said)
 
 
 def test_bad_requests_are_refused_in_a_sentence(served):
