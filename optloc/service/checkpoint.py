@@ -70,8 +70,12 @@ def restore(path: Path, events: Events, now: float) -> None:
     events after its last checkpoint, so all further answers get a higher revision. Raise InvalidProblem for a file that
     is not a checkpoint, is damaged, or has names that the site does not have.
     """
-    with access(anew=True, budget=_BUDGET):  # forget the input: it is written again later
-        found = json_of(read_text(path), path.name)
+    try:
+        with access(anew=True, budget=_BUDGET):  # forget the input: it is written again later
+            found = json_of(read_text(path), path.name)
+    except InvalidProblem as error:
+        what = f"the checkpoint cannot be read ({error.what})"
+        raise InvalidProblem(what, str(path), "use another file, or remove it") from None
     if not isinstance(found, dict) or found.get("format") not in _FORMATS:
         raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)

@@ -366,7 +366,7 @@ def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, reco
     """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
     from optloc.service.sources import standard_input
-    from optloc.service.supervisor import Source, Watch
+    from optloc.service.supervisor import LineSource, Watch
 
     if recording is not None:
         name = str(options.recording)
@@ -375,7 +375,7 @@ def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, reco
             """Read the recording."""
             replay(recording, stream, options.speed, name, adapter)
 
-        stream.start(Source(name, run, is_last=True, tries=0))  # a second attempt would repeat the first lines
+        stream.start(LineSource(name, run, is_last=True, tries=0))  # a second attempt would repeat the first lines
     elif options.stdin:
         read, pending = _reader(sys.stdin)
         stream.start(standard_input(stream, read, adapter, pending))

@@ -13,7 +13,7 @@ from optloc.service.alarms import SourceLost
 from optloc.service.messages import LINE
 from optloc.service.queues import WAITING
 from optloc.service.stream import Stream
-from optloc.service.supervisor import Source, Watch
+from optloc.service.supervisor import LineSource, Watch
 
 # Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
 # written together then stay together at any reading speed, and events with missing rows still close.
@@ -31,7 +31,7 @@ def standard_input(
     read: Callable[[int], bytes],
     adapter: Adapter | None = None,
     pending: Callable[[], bool] = bool,
-) -> Source:
+) -> LineSource:
     """Return standard input as a source, with whose end the stream ends; the arguments are as in `read_lines`."""
 
     def run(watch: Watch) -> None:
@@ -44,7 +44,7 @@ def standard_input(
 
         read_lines(watched, stream, watch.name, adapter, pending)
 
-    return Source("stdin", run, is_last=True, tries=_TRIES)
+    return LineSource("stdin", run, is_last=True, tries=_TRIES)
 
 
 def read_lines(
@@ -94,7 +94,7 @@ def read_lines(
 # Brokers.
 
 
-def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Source:
+def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
     """Return the messages of a topic of an MQTT broker as a source; the broker must be present now.
 
     If too many messages wait, the oldest are dropped and counted. `address` is ``mqtt://user@host:1883/topic``, or
@@ -141,7 +141,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Source
                 raise SourceLost(refusal[0] if refusal else f"the broker is lost ({paho.error_string(code)})")
         client.disconnect()
 
-    return Source("mqtt", run)
+    return LineSource("mqtt", run)
 
 
 def _mqtt_client(parts: Any) -> Any:
@@ -172,7 +172,7 @@ def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Ada
     return number + len(lines)
 
 
-def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Source:
+def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
     """Return the messages of a ZeroMQ socket as a source.
 
     ``tcp://host:5555`` subscribes to a publisher; if too many messages wait, the oldest are dropped.
@@ -212,7 +212,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Sour
         finally:
             context.destroy(0)  # a socket must be closed in its thread
 
-    return Source("zmq", run)
+    return LineSource("zmq", run)
 
 
 def _zeromq_sockets(address: str) -> tuple[Any, Any, Any]:

@@ -48,7 +48,7 @@ class Watch:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class LineSource:
     """A source of lines.
 
     Parameters
@@ -92,9 +92,9 @@ class Supervisor:
         watched: Callable[[Watch], None] = lambda watch: None,
     ) -> None:
         self._close, self._report, self._clock, self._watched = close, report, clock, watched
-        self._running: list[tuple[Source, Watch, Thread]] = []
+        self._running: list[tuple[LineSource, Watch, Thread]] = []
 
-    def start(self, source: Source) -> None:
+    def start(self, source: LineSource) -> None:
         """Run a source in a separate thread until it ends, is given up, or `stop` is called."""
         watch = Watch(source.name, self._clock, self._report)
         self._watched(watch)
@@ -115,7 +115,7 @@ class Supervisor:
         """Return the names of the sources that do not work."""
         return [watch.name for _, watch, _ in self._running if watch.alarm is not None]
 
-    def _run(self, source: Source, watch: Watch) -> None:
+    def _run(self, source: LineSource, watch: Watch) -> None:
         """Run a source, and again after each error with a growing delay (the thread of the source)."""
         tries = 0
         while not watch.stopping.is_set():
