@@ -7,6 +7,7 @@ import random
 import re
 import socket
 import threading
+from contextlib import ExitStack
 
 import pytest
 from service.lines import Answers, arrivals, differences, line
@@ -60,13 +61,12 @@ class Site:
         self.pushed = self._context.socket(zmq.PUSH)
         self.pushed.connect(address)
         self.adapters = {name: adapter_of(name, site.stations) for name in ("chirpstack", "mode-s")}
-        self._http, self._socket, self.codes, self.numbers = None, None, set(), 0
+        self._http, self._socket, self._sockets, self.codes, self.numbers = None, None, ExitStack(), set(), 0
 
     def close(self):
         self.pushed.close(0)
         self._context.term()
-        if self._socket is not None:
-            self._socket.close()
+        self._sockets.close()
         self.stream.close()
         assert self.stream.ended.wait(60.0)
         assert self.stream.error is None
@@ -90,11 +90,8 @@ class Site:
 
     def posted(self, rng, data):
         """Post a message to /fix or /track, as one event or as lines, with odd headers at times."""
-        headers = {
-            "Content-Type": rng.choice(
-                ("application/json", "application/x-ndjson", "text/plain", "APPLICATION/JSON; x")
-            )
-        }
+        kinds = ("application/json", "application/x-ndjson", "text/plain", "APPLICATION/JSON; x")
+        headers = {"Content-Type": rng.choice(kinds)}
         if rng.random() < 0.2:
             headers[rng.choice(("X-Client", "Origin", "Authorization", "Content-Type"))] = odd(rng)
         code, body = self.ask("POST", rng.choice(("/fix", "/fix", "/track")), data, headers)
@@ -107,7 +104,7 @@ class Site:
         path = rng.choice(("/", "/track/", "/data/", "/fix/", "/health?", "/../")) + "".join(
             chr(byte) if 33 <= byte < 127 else f"%{byte:02x}" for byte in data[: rng.randrange(1, 200)]
         )
-        code, body = self.ask(rng.choice(("GET", "HEAD", "PUT", "OPTIONS", "DELETE")), path)
+        code, _ = self.ask(rng.choice(("GET", "HEAD", "PUT", "OPTIONS", "DELETE")), path)
         assert code == 200 or code in REFUSALS, (code, path)
 
     def raw(self, rng, data):
@@ -121,7 +118,8 @@ class Site:
 
     def told(self, rng, data):
         """Send a message to the websocket, and read what it sends meanwhile."""
-        self._socket = self._socket or connect(f"ws://127.0.0.1:{self.port}/ws", open_timeout=20.0)
+        if self._socket is None:
+            self._socket = self._sockets.enter_context(connect(f"ws://127.0.0.1:{self.port}/ws", open_timeout=20.0))
         try:
             self._socket.send(data if rng.random() < 0.02 else data.decode("utf-8", "replace"))
             while True:
@@ -190,9 +188,7 @@ def run(site, z, seed, count):
     level = loggers[0].level
     loggers[0].setLevel(logging.DEBUG)
     messages, server = originals(site, z), Site(site)
-    ways = (
-        [server.posted] * 4 + [server.told] * 2 + [server.mqtt] * 2 + [server.zeromq] * 2 + [server.looked, server.raw]
-    )
+    ways = [*[server.posted] * 4, *[server.told, server.mqtt, server.zeromq] * 2, server.looked, server.raw]
     ways += [lambda rng, data, name=name: server.adapted(rng, data, name) for name in server.adapters]
     forms = ["line"] * 12 + list(server.adapters)
     try:
