@@ -85,7 +85,7 @@ class AccessChecks:
         if any(not _is_same(origin, given["host"][0]) for origin in given["origin"]):
             return 403, "requests from pages of other sites are refused", []
         if self._access.tokens and not self._has_token(given["authorization"]):
-            # A browser asks its user for a name and a password: the password is the token.
+            # A browser then opens a form for a name and a password: the password is the token.
             challenges = [(b"www-authenticate", f"{scheme} {_REALM}".encode()) for scheme in ("Bearer", "Basic")]
             return 401, "a valid token is missing; send the header Authorization: Bearer TOKEN", challenges
         return None

@@ -52,7 +52,7 @@ class Connections:
     def admit(self, connection: Connection) -> bool:
         """Add a connection, and return whether it has a place.
 
-        If there is none, the oldest silent connection is dropped: first of its address, else of all addresses.
+        Without a free place, the oldest silent connection is dropped: first of its address, else of all addresses.
         """
         own = self._of[group_of(connection.address)]
         crowd = own if len(own) >= self._each else self._all if len(self._all) >= self._most else None
@@ -142,7 +142,7 @@ def protocol_of(connections: Connections, head: float = HEAD, whole: float = WHO
             super().on_response_complete()
 
         def handle_websocket_upgrade(self, event: Any) -> None:
-            """Pass the connection to the protocol of websockets, which has limits of its own."""
+            """Pass the connection to the protocol of websockets, which has other limits."""
             self.leave()
             super().handle_websocket_upgrade(event)
 

@@ -45,7 +45,9 @@ def application(stream: Stream) -> Any:
     # `:path` lets a name of a target have slashes
     routes: list[Any] = [Route(each.path.replace("}", ":path}"), each.run, methods=[each.method]) for each in table]
     routes.append(WebSocketRoute("/ws", Sockets(stream).listen))
-    return Starlette(routes=routes, exception_handlers={HTTPException: failed})
+    app = Starlette(routes=routes, exception_handlers={HTTPException: failed})
+    app.router.redirect_slashes = False  # a path with a slash at its end is another path
+    return app
 
 
 def _json(found: Record, code: int = 200, media: str = JSON) -> Any:

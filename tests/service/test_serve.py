@@ -17,6 +17,7 @@ ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 from optloc.base.errors import InvalidProblem  # noqa: E402  (after the libraries that may be missing)
 from optloc.cli.track import runs_of  # noqa: E402
 from optloc.files import read  # noqa: E402
+from optloc.service.http_options import AccessRules, digest_of  # noqa: E402
 from optloc.service.serve import serve  # noqa: E402
 from optloc.service.stream import Settings, Stream  # noqa: E402
 from optloc.service.tracks import Following  # noqa: E402
@@ -239,3 +240,23 @@ def test_a_place_that_is_taken_is_said(served):
     stream, port = served
     with pytest.raises(InvalidProblem, match=f"the address 127.0.0.1:{port} is not available"):
         serve(stream, port=port)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "fixes.example.org"])
+def test_other_machines_need_a_token(served, host):
+    with pytest.raises(InvalidProblem, match=f"other machines reach {host}, and requests need no token") as caught:
+        serve(served[0], host, 0)
+    assert "--token-file FILE, or --no-token" in str(caught.value)
+
+
+@pytest.mark.parametrize("access", [AccessRules(tokens=(digest_of("x" * 16),)), AccessRules(open=True)])
+def test_a_server_for_others_answers_under_its_address(site, access):
+    stream = Stream(site, Settings(), Answers())
+    port, stop = serve(stream, "0.0.0.0", 0, access)
+    given = {"Host": "192.168.1.5", "Authorization": f"Bearer {'x' * 16}"}
+    assert ask(port, "GET", "/health", **given)[0] == 200
+    assert ask(port, "GET", "/health", **given | {"Host": "evil.example"})[0] == 400
+    assert ask(port, "GET", "/health", Host="192.168.1.5")[0] == (401 if access.tokens else 200)
+    stream.close()
+    assert stream.ended.wait(10.0)
+    stop()
