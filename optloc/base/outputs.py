@@ -263,13 +263,18 @@ class GrowingFile:
         self._begun = self._whole = False
 
     def append(self, data: bytes) -> None:
-        """Append data immediately; raise InvalidProblem if this fails."""
+        """Append data immediately; raise InvalidProblem if this fails. The file then has none of the data."""
         mode = "ab" if self._begun else "wb" if _REPLACES.get() else "xb"
         self._begun, self._whole = True, False
         # One write without a buffer, so that an interrupted run leaves complete lines.
         with _invalid_if_unwritable(self.partial), self.partial.open(mode, buffering=0) as file:
-            while data:
-                data = data[file.write(data) :]
+            size = os.fstat(file.fileno()).st_size
+            try:
+                while data:
+                    data = data[file.write(data) :]
+            except OSError:
+                file.truncate(size)  # a full disk accepts a part, which a second attempt would repeat
+                raise
         self._whole = True
 
     def finish(self) -> None:

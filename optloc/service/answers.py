@@ -16,6 +16,7 @@ import numpy as np
 
 from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
+from optloc.service.messages import shown_name
 from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, ellipse95, live_mark, mark_of
 from optloc.tracking import Entry, scan_sentence
 
@@ -60,7 +61,7 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     names, others, alone = ("event", *columns), _alternatives(fix), np.ravel(fix.unchecked)
     made = [
         dict(zip(names, row, strict=True))
-        for row in zip((event.name for event in events), *columns.values(), strict=True)
+        for row in zip((_id_of(event) for event in events), *columns.values(), strict=True)
     ]
     for i, (record, event) in enumerate(zip(made, events, strict=True)):
         record["alternatives"] = others.get(i, [])
@@ -76,9 +77,14 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
 
 def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
     """Return the answer to an event without a position; `why` is its status, or an error."""
-    record = {"event": event.name, "phase": phase, **why, "position": None}
+    record = {"event": _id_of(event), "phase": phase, **why, "position": None}
     _add_exceptions(record, event)
     return record
+
+
+def _id_of(event: Event) -> str:
+    """Return the id of an event, without the name of its client."""
+    return event.name.rpartition("\n")[2]
 
 
 def _known(values: Array, known: Array) -> list[Any]:
@@ -106,7 +112,11 @@ def _alternatives(fix: Fix) -> dict[int, list[Record]]:
 
 
 def _add_exceptions(record: Record, event: Event) -> None:
-    """Add the unusual properties of an event: closing reason, revision, conflict, target."""
+    """Add the properties of an event that not all events have: client, time, closing reason, revision, and others."""
+    if event.when is not None:
+        record.setdefault("time", event.when * 1e-12)
+    if _id_of(event) != event.name:
+        record |= shown_name(event.name)
     if event.closed != "whole":
         record["closed"] = event.closed
     if event.revision > 1:
@@ -134,7 +144,9 @@ def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | N
         if old is None:
             out.append(new | proof)
         elif _is_same_fix(new, old):
-            changed = {key: new[key] for key in ("alternatives", "revision", "reason", "target") if new.get(key)}
+            changed = {
+                key: new[key] for key in ("alternatives", "revision", "reason", "target", "client") if new.get(key)
+            }
             out.append({"event": new["event"], "phase": "proof", "status": new["status"], **proof, **changed})
         else:
             head = {"event": new.pop("event"), "phase": "proof"}
@@ -167,7 +179,7 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
     """
     d, mean = problem.dimension, entry.updated.mean
     known = bool(np.isfinite(mean).all())
-    record: Record = {"event": event.name, "phase": "track", "target": UNNAMED, "time": time, "status": entry.label}
+    record: Record = {"event": _id_of(event), "phase": "track", "target": UNNAMED, "time": time, "status": entry.label}
     for i, name in enumerate(("position", "velocity", "acceleration")[: len(mean) // d]):
         record[name] = mean[i * d : (i + 1) * d].tolist() if known else None
     record["cov"] = entry.updated.cov.tolist() if known else None
@@ -189,9 +201,10 @@ def unproven(event: Event, why: str, before: Record | None) -> Record:
     """
     proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
     proof |= {"target": event.target} if event.target else {}
+    names = shown_name(event.name)
     if before is not None:
-        return {"event": event.name, "phase": "proof", "status": before["status"], **proof}
-    return {"event": event.name, **proof}
+        return {**names, "phase": "proof", "status": before["status"], **proof}
+    return {**names, **proof}
 
 
 def join(first: Record | None, then: Record) -> Record:
@@ -252,7 +265,7 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
     `seen` is the age of the fix, s.
     """
     return {
-        "hex": record.get("target") or record["event"],
+        "hex": _name_of(record),
         "type": "mlat",
         "lat": round(record["lat_deg"], 6),
         "lon": round(record["lon_deg"], 6),
@@ -284,7 +297,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
         )
         for each in record.get("alternatives", ())
     ]
-    name = record.get("target") or record["event"]
+    name = _name_of(record)
     return mark_of(
         frame,
         position,
@@ -332,8 +345,35 @@ FORMATS: Mapping[str, Callable[[Record, Frame], bytes | None]] = {
 }
 """Output formats by name: functions of a record and the frame of its site that return a line."""
 
+# Formats whose readers take each line as a new position, and a line without a position as the loss of all positions:
+# they get one line for each event, the last.
+_ONCE = ("nmea",)
+
+
+def to_feed(name: str, record: Record, whole: Record, frame: Frame, *, last: bool) -> bytes:
+    """Return an answer of an event as a line of a format; empty if the format leaves it out.
+
+    `record` is the answer, `whole` all answers of the event so far as one record, and `last` marks the last answer.
+    Lines of JSON have the answer alone, since their readers join it by its event. The other formats replace the first
+    answer by a whole second answer with its status.
+    """
+    if name in _ONCE and not last:
+        return b""
+    return FORMATS[name](record if name == "ndjson" else whole, frame) or b""
+
+
 OF_RECORDS = ("ndjson", "geojson")
 """Formats with lines for notes, errors and health; with other formats these go to standard error."""
+
+
+def _event_of(record: Record) -> tuple[str, str]:
+    """Return the client and the id of the event of a record."""
+    return record.get("client", ""), record["event"]
+
+
+def _name_of(record: Record) -> str:
+    """Return the name of a fix in feeds: its target, or its event with the client."""
+    return record.get("target") or "/".join(filter(None, _event_of(record)))
 
 
 class Latest:
@@ -360,9 +400,9 @@ class Latest:
         if "event" not in record or "note" in record:
             return
         self._last = time()
-        name = record.get("target") or record["event"]
+        name = _name_of(record)
         old = self._held.get(name)
-        if old is not None and old[1]["event"] == record["event"]:
+        if old is not None and _event_of(old[1]) == _event_of(record):
             self._held[name] = (old[0], join(old[1], record))
             if record.get("position") is not None:
                 self._trails[name][-1] = record["position"]
@@ -400,7 +440,7 @@ class Latest:
         """
         now, found = time(), []
         for age, record in self._present():
-            name = record.get("target") or record["event"]
+            name = _name_of(record)
             drawn = self._drawn.get(name)
             # A stored record is never changed, only replaced: the same object has the same mark.
             if drawn is None or drawn[0] is not record:

@@ -1,18 +1,24 @@
-"""Checkpoints of a stream: open events, ids of answered events, and counts, as one JSON object."""
+"""Checkpoints of a stream: open events, ids of answered events, counts and the account, as one JSON object."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
 from optloc.files import Budget, access, json_of, read_text
 from optloc.problem import InvalidProblem
+from optloc.service.account import SETTLED, STATES, total
 from optloc.service.answers import Record
-from optloc.service.events import Event, Events, name_under, picoseconds, rows_and_arrivals
+from optloc.service.events import Event, Events
+from optloc.service.messages import name_under, picoseconds, rows_and_arrivals, scoped_under
 from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 
-_FORMAT = "optloc live 1"
+_FORMAT = "optloc live 2"
+# Format 1 has neither the account nor revisions.
+_FORMATS = ("optloc live 1", _FORMAT)
 # Bytes of a checkpoint with the largest state: 4096 open events of 64 kB and 65 536 ids.
 _BUDGET = Budget(text=1 << 29)
 # Largest count: a million a second for 30 000 years, which is exact as a float.
@@ -23,12 +29,17 @@ _NAMES: dict[type, str] = {list: "list", dict: "object", str: "text", int: "whol
 T = TypeVar("T")
 
 
-def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
+def state_of(events: Events, unwritten: Iterable[Event] = (), *, ended: bool = False) -> Record:
     """Return the state that a stream needs to continue.
 
-    `unwritten` has closed events whose answers may not be written yet: they count as open.
+    `unwritten` has closed events whose answers may not be written yet: they count as open. If an event is there in two
+    revisions, the last revision is stored, with the lines of both. `ended` is whether the stream ended by itself: its
+    answers are then complete. After another end, events may be answered again, with a higher revision.
     """
-    site = events.site
+    site, waiting, lines = events.site, dict[str, Event](), dict[str, Counter[str]]()
+    for event in (*unwritten, *events.open.values()):
+        waiting[event.name] = event
+        lines.setdefault(event.name, Counter()).update(event.lines)
 
     def spelled(event: Event) -> Record:
         """Return an event as JSON values: rows by kind and stations, arrivals by station in picoseconds as text."""
@@ -37,38 +48,51 @@ def state_of(events: Events, unwritten: dict[str, Event]) -> Record:
         about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
         about |= {"when": None if event.when is None else str(event.when), "track": event.track}
         about |= {"refused": event.refused} if event.refused else {}
+        about |= {"lines": dict(lines[event.name])}
         return {"event": event.name, "rows": rows, "times": times, **about}
 
     return {
         "format": _FORMAT,
         "site": site.source,
-        "open": [spelled(event) for event in (*unwritten.values(), *events.open.values())],
-        "closed": [name for name in events.closed if name not in unwritten],
+        "ended": ended,
+        "revision": events.revision,
+        "open": [spelled(event) for event in waiting.values()],
+        "closed": [name for name in events.closed if name not in waiting],
         "counts": dict(events.metrics.counts),
+        "account": events.metrics.account.stored(total(lines.values())),
     }
 
 
 def restore(path: Path, events: Events, now: float) -> None:
     """Restore a checkpoint into the events of a stream that has read no line: all of the checkpoint, or nothing.
 
-    `now` is the time of the clock of the stream, s. Raise InvalidProblem for a file that is not a checkpoint, is
-    damaged, or has names that the site does not have.
+    `now` is the time of the clock of the stream, s. Unless the former stream ended by itself, it may have answered
+    events after its last checkpoint, so all further answers get a higher revision. Raise InvalidProblem for a file that
+    is not a checkpoint, is damaged, or has names that the site does not have.
     """
-    with access(anew=True, budget=_BUDGET):  # forget the input: it is written again later
-        found = json_of(read_text(path), path.name)
-    if not isinstance(found, dict) or found.get("format") != _FORMAT:
+    try:
+        with access(anew=True, budget=_BUDGET):  # forget the input: it is written again later
+            found = json_of(read_text(path), path.name)
+    except InvalidProblem as error:
+        what = f"the checkpoint cannot be read ({error.what})"
+        raise InvalidProblem(what, str(path), "use another file, or remove it") from None
+    if not isinstance(found, dict) or found.get("format") not in _FORMATS:
         raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)
     try:
-        closed = [name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
-        counts = _counts(found.get("counts"))
+        closed = [scoped_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
+        counts, account = _counts(found.get("counts")), _account(found.get("account", {}))
+        ended = _typed(found.get("ended", False), bool, "ended")
+        revision = _count(found.get("revision", 1), "revision") + (not ended)
         # Fill `opened` first, and change `events` only if the whole file is valid.
         taken, opened = set(closed), dict[str, Event]()
         for number, each in enumerate(_typed(found.get("open"), list, "open"), 1):
             where = f"{path}, open event {number}"
             event = _event(each, events.site, now, taken)
             taken.add(event.name)
+            event.revision = max(event.revision + (not ended), revision)
             opened[event.name] = event
+        _check_open(account, total(event.lines for event in opened.values()))
     except InvalidProblem as error:
         if error.where in ("kind", "a", "b", "station"):
             raise InvalidProblem(error.what, where, "the checkpoint is of another site; use another file") from None
@@ -76,7 +100,9 @@ def restore(path: Path, events: Events, now: float) -> None:
     for name in closed:
         events.remember(name, None)
     events.open.update(opened)
+    events.revision = revision
     events.metrics.counts.update(counts)
+    events.metrics.account.restore(account)
 
 
 def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
@@ -97,7 +123,7 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")
-    name, target = name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
+    name, target = scoped_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
         raise InvalidProblem(f"the event {name!r} occurs twice", "event", "remove one")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))
@@ -107,6 +133,8 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     event.when = None if each.get("when") is None else picoseconds(each["when"], "time_ps")
     event.track = _typed(each.get("track", False), bool, "track")
     event.refused = refused
+    lines = _typed(each.get("lines", {}), dict, "lines")
+    event.lines = {source: _count(count, "lines") for source, count in lines.items()}
     return event
 
 
@@ -140,3 +168,22 @@ def _counts(found: Any) -> dict[str, int]:
     if unknown:
         raise InvalidProblem(f"there is no count {min(unknown)[:_SHOWN]!r}", "counts", "remove it")
     return {name: _count(number, "counts") for name, number in counts.items()}
+
+
+def _account(found: Any) -> dict[str, dict[str, int]]:
+    """Return the account of a checkpoint: counts of `STATES` by source; raise InvalidProblem if it does not balance."""
+    account = {}
+    for source, counts in _typed(found, dict, "account").items():
+        if _typed(counts, dict, "account").keys() != set(STATES):
+            raise InvalidProblem("the counts of a source are incomplete", "account", "remove it")
+        account[source] = {state: _count(counts[state], "account") for state in STATES}
+    for counts in account.values():
+        if counts["received"] != sum(counts[state] for state in (*SETTLED, "open")):
+            raise InvalidProblem("the counts of a source do not balance", "account", "remove it")
+    return account
+
+
+def _check_open(account: dict[str, dict[str, int]], held: Counter[str]) -> None:
+    """Raise InvalidProblem if the open lines of an account are not the lines `held` by the open events."""
+    if {source: counts["open"] for source, counts in account.items() if counts["open"]} != +held:
+        raise InvalidProblem("the open lines of a source are not the lines of the open events", "account", "remove it")

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, current_thread, main_thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -38,11 +38,12 @@ from optloc.cli import (
 )
 from optloc.files import claim, visible
 from optloc.problem import InvalidProblem, nearest
+from optloc.service.http_options import AccessRules, Hosts, Http, NoToken, Tokens, access_of, address_of
 
 if TYPE_CHECKING:
+    from optloc.service.adapters import Adapter
     from optloc.service.recording import Recorded
     from optloc.service.site import Site, SiteOptions
-    from optloc.service.sources import Adapter
     from optloc.service.stream import Stream
 
 # Import the stream inside the commands, so that --help prints without delay.
@@ -84,12 +85,6 @@ State = Annotated[
 Every = Annotated[str, typer.Option("--every", metavar="TIME", help="Time between checkpoints.")]
 Record = Annotated[Path | None, typer.Option("--record", metavar="FILE", help="Record the input lines.")]
 
-Http = Annotated[
-    str | None,
-    typer.Option(
-        "--http", metavar="[HOST:]PORT", help="Accept HTTP requests as well; by default from this machine only."
-    ),
-]
 Mqtt = Annotated[
     str | None, typer.Option("--mqtt", metavar="URL", help="Read a topic of an MQTT broker: mqtt://host:1883/topic.")
 ]
@@ -143,6 +138,9 @@ def live(
     every: Every = "5 s",
     record: Record = None,
     http: Http = None,
+    hosts: Hosts = None,
+    token_file: Tokens = None,
+    no_token: NoToken = False,
     mqtt: Mqtt = None,
     zmq: Zmq = None,
     adapter: Adapt = None,
@@ -176,6 +174,7 @@ def live(
     options = ServiceOptions(
         settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq),
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
+        access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -183,7 +182,7 @@ def live(
 SERVED = example(
     "optloc serve site.toml",
     'curl -d \'{"event": "1", "z": [283.0, 1739.5, 1102.9, 524.3, 2344.4]}\' localhost:8200/fix',
-    "optloc serve site.toml --http 0.0.0.0:8200 --mqtt mqtt://broker/toa/#",
+    "optloc serve site.toml --http 0.0.0.0:8200 --token-file tokens.txt --mqtt mqtt://broker/toa/#",
 )
 
 
@@ -192,6 +191,9 @@ def serve(
     http: Annotated[
         str, typer.Option("--http", metavar="[HOST:]PORT", help="Address of the server; by default this machine only.")
     ] = "8200",
+    hosts: Hosts = None,
+    token_file: Tokens = None,
+    no_token: NoToken = False,
     method: Method = "auto",
     wait: Wait = "50 ms",
     late: Late = "drop",
@@ -229,6 +231,7 @@ def serve(
     options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
+        access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -277,6 +280,7 @@ class ServiceOptions:
     proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
     not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
     recording. stdout: whether answers go to standard output. stated: options on the wave and the height, or None.
+    access: rules of access to HTTP, or None.
     """
 
     settings: dict[str, Any]
@@ -292,16 +296,18 @@ class ServiceOptions:
     stdin: bool = True
     stdout: bool = True
     stated: SiteOptions | None = None
+    access: AccessRules | None = None
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal arrives, and return the exit code.
+    """Run a stream until its source ends or a signal arrives, and return the exit code, as in `wait`.
 
     `file` is the problem file of the site.
     """
+    from optloc.service.adapters import adapter_of
     from optloc.service.recording import read_recording
     from optloc.service.site import read_site
-    from optloc.service.sources import adapter_of
+    from optloc.service.standard_error import standard_error
     from optloc.service.stream import Settings, Stream
 
     if not options.speed > 0.0:
@@ -316,10 +322,11 @@ def run_live(file: Path, options: ServiceOptions) -> int:
     given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
     settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
     claim(settings.record, inputs=[file])
-    say = _silent if options.quiet else _say
     write = _write(sys.stdout.buffer) if options.stdout else _silent
-    with _threads(), ExitStack() as stops:
+    with _threads(), standard_error(quiet=options.quiet) as (say, messages), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
+        stream.watch_output(messages)
+        stops.callback(stream.sources.stop)
         stops.callback(stream.close)  # also if a source cannot be opened
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
@@ -328,7 +335,10 @@ def run_live(file: Path, options: ServiceOptions) -> int:
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
-    say(json.dumps({"health": stream.health()}))
+        say(json.dumps({"health": stream.health()}))
+        failed = stream.sources.failed
+        if failed:
+            say(f"The stream ends with exit code {code}: {', '.join(failed)} failed.")
     return code
 
 
@@ -342,30 +352,33 @@ def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stop
 
     opened = ""
     if options.http is not None:
-        host, _, port = options.http.rpartition(":")
-        if not port.isdecimal():
-            raise InvalidProblem(f"{options.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
-        host = host.strip("[]") or requests.HOST
-        number, stop = requests.serve(stream, host, int(port))
+        host, port = address_of(options.http)
+        number, stop = requests.serve(stream, host, port, options.access)
         stops.callback(stop)
         opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
     for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
         if address is not None:
-            stops.callback(begin(stream, address, adapter))
+            stream.start(begin(stream, address, adapter))
     return opened
 
 
 def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
     """Read a recording or standard input in a separate thread, if requested."""
     from optloc.service.recording import replay
-    from optloc.service.stream import read_lines
+    from optloc.service.sources import standard_input
+    from optloc.service.supervisor import LineSource, Watch
 
     if recording is not None:
-        lines = recording if adapter is None else [each._replace(data=adapter(each.data)) for each in recording]
-        _begin(lambda: replay(lines, stream, options.speed, str(options.recording)), stream)
+        name = str(options.recording)
+
+        def run(_: Watch) -> None:
+            """Read the recording."""
+            replay(recording, stream, options.speed, name, adapter)
+
+        stream.start(LineSource(name, run, is_last=True, tries=0))  # a second attempt would repeat the first lines
     elif options.stdin:
         read, pending = _reader(sys.stdin)
-        _begin(lambda: read_lines(read, stream, "stdin", adapter, pending), stream)
+        stream.start(standard_input(stream, read, adapter, pending))
 
 
 def site_options(
@@ -411,17 +424,24 @@ def input_description(site: Site) -> Iterator[str]:
     )
 
 
+SOURCE_FAILED = 3
+"""Exit code of a stream that ends while one of its sources does not work."""
+
+
 def wait(stream: Stream, interrupted: Event) -> int:
     """Wait for the end of a stream and return its exit code; raise the error that ended the stream, if any.
 
-    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, 0 otherwise.
+    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, `SOURCE_FAILED`
+    if a source does not work, and 0 otherwise.
     """
     # on Windows, a wait without a timeout blocks signals
     while not stream.ended.wait(1.0):
         pass
     if stream.error is not None:
         raise stream.error
-    return STOPPED if interrupted.is_set() else READER_GONE if stream.failed else 0
+    if interrupted.is_set() or stream.failed:
+        return STOPPED if interrupted.is_set() else READER_GONE
+    return SOURCE_FAILED if stream.sources.failed else 0
 
 
 @contextmanager
@@ -480,19 +500,6 @@ def _threads() -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def _begin(source: Callable[[], None], stream: Stream) -> None:
-    """Read a source in a separate thread, and close the stream at its end."""
-
-    def run() -> None:
-        """Read the source, then close the stream, also after an error."""
-        try:
-            source()
-        finally:
-            stream.close()
-
-    Thread(target=run, name="optloc input", daemon=True).start()
-
-
 def _write(file: Any) -> Callable[[bytes], None]:
     """Return a function that writes bytes to a binary file at once, without a buffer that delays answers."""
 
@@ -522,12 +529,15 @@ def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
         except (OSError, ValueError):
             return False  # on Windows, select works for sockets only
 
-    return lambda count: os.read(descriptor, count), pending
+    def read(count: int) -> bytes:
+        """Return at most `count` available bytes; wait for the first byte."""
+        while True:
+            try:
+                return os.read(descriptor, count)
+            except BlockingIOError:  # the writer of the pipe has set the mode that never waits
+                select.select([descriptor], [], [])
 
-
-def _say(line: str) -> None:
-    """Print a line for people to standard error."""
-    typer.echo(visible(line), err=True)
+    return read, pending
 
 
 def _silent(_: str | bytes) -> None:

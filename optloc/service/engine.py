@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.engine import simulate
 from optloc.model_checks import refuse_impossible, suspicious_values
 from optloc.problem import Array, InvalidProblem, Status
 from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
@@ -323,15 +324,16 @@ class Engine:
                 taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), BATCH))]
                 self._changed.notify_all()
             for group in _grouped([item for item in taken if not item.done]):
-                self._conclude(group, {item.event.name: item for item in taken})
+                self._conclude(group, {id(item.event): item for item in taken})
 
-    def _conclude(self, group: EventGroup, items: dict[str, Pending]) -> None:
+    def _conclude(self, group: EventGroup, items: dict[int, Pending]) -> None:
         """Prove the fixes of events, and answer the events that are still open.
 
-        `items` has the pending proofs by the name of the event. Events that passed their deadline meanwhile have their
+        `items` has the pending proofs by the identity of the event, since late rows may have given an event of the same
+        name. Events that passed their deadline meanwhile have their
         last answer, so their proofs are dropped.
         """
-        pending = [items[event.name] for event in group.events]
+        pending = [items[id(event)] for event in group.events]
         try:
             fix = group.ready.full(group.z)
             records = proof_records(fix, group.events, [item.before for item in pending])
@@ -348,6 +350,26 @@ class Engine:
         self._metrics.took("proof", [self._clock() - event.stamp for event, _ in answered])
         for event, record in answered:
             self._answer(event, record, last=True)
+
+
+def warm_up(site: Site, phases: str) -> None:
+    """Solve simulated events, so that machine code is loaded before the first real event.
+
+    `phases` are the phases of the answers: "two", "one" or "fix".
+    """
+    ready = site.ready((), site.rows)
+    assert ready is not None  # a site has rows
+    problem = ready.fast.problem
+    x = np.zeros(problem.layout.size)
+    slot, _ = problem.layout.find("position")
+    # away from the centre, where the geometry may be symmetric
+    x[slot.start : slot.start + slot.size] = site.position.mean(0) + 0.1 * np.ptp(site.position, axis=0)
+    with np.errstate(all="ignore"):
+        z = simulate(problem, x, 0, BATCH).z
+    for count in (1, BATCH):
+        ready.fast(z[:count])
+        if phases != "fix":
+            ready.full(z[:count])
 
 
 def _order(key: int | SiteRow) -> tuple[int, tuple[str, ...]]:

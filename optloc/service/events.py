@@ -1,333 +1,44 @@
-"""Lines and events of a stream: parsing of lines, closing of events, and rows that are late or repeated.
+"""Events of a stream: open while rows arrive, then closed and answered, then remembered.
 
-A line has rows, or arrivals at stations, of one event. An event is open until all its rows are present or its waiting
-time is over; then it closes and is answered. Two clocks are used. `now` is a monotonic clock, s. `when` is the clock
-for which events wait, s. It follows recorded times in a replay, and runs slowly while lines wait to be read.
+A message has rows, or arrivals at stations, of one event. An event is open until all its rows are present or its
+waiting time is over; then it closes and is answered. Two clocks are used. `now` is a monotonic clock, s. `when` is the
+clock for which events wait, s. It follows recorded times in a replay, and runs slowly while lines wait to be read.
 """
 
 from __future__ import annotations
 
-import json
-import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 from zlib import crc32
 
-from optloc.files import has_controls
-from optloc.problem import LARGEST, InvalidProblem, nearest, no_station
+from optloc.problem import InvalidProblem
+from optloc.service.messages import Key, Message, shown_name
 from optloc.service.metrics import Metrics
-from optloc.service.site import Site, SiteRow, UnknownName
-
-# Parsing of a line.
-
-LINE = 1 << 16
-"""Largest size of a line, bytes: more than a thousand rows."""
-
-COMMANDS = ("flush", "health")
-# Largest number of characters of an id or a name, and of rows of an event: far more than any network has.
-_NAME, _ROWS = 256, 4096
-_KEYS = {
-    *("command", "event", "z", "rows", "arrivals", "station", "kind", "a", "b", "sigma", "more", "target", "received"),
-    *("time", "time_ns", "time_ps"),
-}
-_ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
-# Decimals that give picoseconds, by the key of a time.
-_DIGITS = {"time": 12, "time_ns": 3, "time_ps": 0}
-_DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
-# Picoseconds of 30 000 years: no clock has a later time.
-_LATEST = 10**24
-
-Key = int | SiteRow
-"""A row of an event: its number in the template, or a row that is not in the template."""
-
-
-def _refuse(word: str) -> Any:
-    """Raise ValueError for a constant that JSON does not permit, such as NaN."""
-    raise ValueError(f"{word} is not a number")
-
-
-# Reject NaN and infinity, which are not JSON, during parsing.
-_JSON = json.JSONDecoder(parse_constant=_refuse)
-
-
-class Message(NamedTuple):
-    """The content of a line.
-
-    Parameters
-    ----------
-    event : str
-        Event of the rows; empty for a command.
-    rows : dict of Key to float
-        Values in the units of the site.
-    times : dict of int to int
-        Arrivals at stations, picoseconds.
-    whole : bool
-        Whether the event ends with this line.
-    sigmas : dict of Key to float, optional
-        Standard deviations of rows.
-    target : str
-        Name of the target, for the answer.
-    command : str
-        Command instead of rows.
-    when : int, optional
-        Time of the event, picoseconds; None: use the first arrival.
-    """
-
-    event: str
-    rows: dict[Key, float]
-    times: dict[int, int]
-    whole: bool
-    sigmas: dict[Key, float] | None = None
-    target: str = ""
-    command: str = ""
-    when: int | None = None
-
-
-def parse(line: bytes, site: Site) -> Message:
-    """Return the content of a line with one JSON object.
-
-    Raises
-    ------
-    InvalidProblem
-        For an invalid line; the message names the key. `UnknownName` has the event of the line.
-    """
-    if len(line) > LINE:
-        raise InvalidProblem(f"the line has {len(line)} bytes, more than {LINE}", None, "send fewer rows in a line")
-    try:
-        found = _JSON.decode(line.decode())
-    except RecursionError:
-        raise InvalidProblem("the line is nested too deeply", None, "send one flat object in each line") from None
-    except ValueError as error:
-        what = "it is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error).partition(":")[0].lower()
-        raise InvalidProblem(f"this is not JSON: {what}", None, "send one object in each line") from None
-    if type(found) is not dict:
-        raise InvalidProblem("this is not a JSON object", None, 'send {"event": "1", "z": [...]}')
-    z = found.get("z")
-    if len(found) == 2 and type(z) is list:
-        return Message(_event(found), _values(z, site), {}, whole=True)  # the most frequent form of values
-    station, time = found.get("station"), found.get("time_ns")
-    if len(found) == 3 and type(time) is int and abs(time) < _LATEST // 1000 and type(station) is str:
-        number = site.number.get(station, -1)  # the most frequent form of arrivals
-        if number >= 0 and site.arriving:
-            return Message(_event(found), {}, {number: 1000 * time}, whole=False)
-    return _general(found, site)
-
-
-def _general(found: dict[str, Any], site: Site) -> Message:
-    """Return the content of a line with any permitted keys; errors as in `parse`."""
-    unknown = found.keys() - _KEYS
-    if unknown:
-        name = min(unknown)
-        raise InvalidProblem(f"unknown key {name[:40]!r}", None, nearest(name, sorted(_KEYS)))
-    if "command" in found:
-        command = found["command"]
-        if command not in COMMANDS:
-            raise InvalidProblem(f"unknown command {str(command)[:40]!r}", "command", f"use {' or '.join(COMMANDS)}")
-        return Message("", {}, {}, whole=False, command=command)
-    event = _event(found)
-    target = _text(found["target"], "target") if "target" in found else ""
-    forms: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
-    forms += ["z"] if "z" in found and "kind" not in found else []
-    if len(forms) != 1 and forms != ["rows", "arrivals"]:
-        what = f"the line has {' and '.join(forms)}" if forms else "the line has no rows"
-        raise InvalidProblem(what, None, "give one of z, rows, arrivals, station, kind")
-    more = found.get("more", forms[0] in ("station", "kind"))
-    if type(more) is not bool:
-        raise InvalidProblem("the value is neither true nor false", "more", "send true if more rows will come")
-    try:
-        rows, sigmas, times = _named(found, forms, site)
-    except UnknownName as error:
-        error.event, error.whole = event, not more
-        raise
-    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, forms))
-
-
-def _named(
-    found: dict[str, Any], forms: list[str], site: Site
-) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
-    """Return the values, the standard deviations and the arrivals of a line, by row or station.
-
-    `found` is the line. `forms` are the keys under which the line has data: "rows", "arrivals", "z", "station" or
-    "kind". Values and standard deviations are in the units of the site, arrivals in picoseconds.
-    """
-    rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
-    if "rows" in forms:
-        for entry in _list(found["rows"], "rows"):
-            _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
-    if "arrivals" in forms:
-        for entry in _list(found["arrivals"], "arrivals"):
-            _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
-    if "z" in forms:
-        rows = _values(_list(found["z"], "z"), site)
-    elif "station" in forms:
-        _arrival(found, site, times)
-    elif "kind" in forms:
-        _row(found, site, rows, sigmas)
-    return rows, sigmas, times
-
-
-def _event(found: Mapping[str, Any]) -> str:
-    """Return the id of the event of a line; a whole number becomes text."""
-    if "event" not in found:
-        raise InvalidProblem("the line has no event", None, 'give each line an id: "event": "1"')
-    name = found["event"]
-    return str(name) if type(name) is int and abs(name) < _LATEST else _text(name, "event")
-
-
-def _text(given: Any, key: str) -> str:
-    """Return a name under `key`; raise InvalidProblem for other values, such as text with control characters."""
-    if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
-        raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {_NAME} printable characters")
-    return given
-
-
-def _when(found: Mapping[str, Any], forms: list[str]) -> int | None:
-    """Return the time of an event in picoseconds; None if the line has no time, or only the time of its arrival."""
-    given = [key for key in _DIGITS if key in found]
-    if forms == ["station"] or not given:
-        return None
-    if len(given) > 1:
-        raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
-    value = found[given[0]]
-    if type(value) is float:  # for a track, a float is precise enough (0.25 us); for an arrival it is not
-        value = round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
-        if abs(value) >= _LATEST:
-            raise _beyond_clocks(found[given[0]], given[0])
-        return value
-    return picoseconds(value, given[0])
-
-
-def _list(given: Any, key: str) -> list[Any]:
-    """Return a list of 1 to 4096 entries under `key`; raise InvalidProblem for other values."""
-    if type(given) is not list or not 0 < len(given) <= _ROWS:
-        raise InvalidProblem(f"the value is not a list of 1 to {_ROWS} entries", key, "give a list")
-    return given
-
-
-def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
-    """Return an entry as an object that has only the permitted `keys`; raise InvalidProblem with `where` otherwise."""
-    if type(given) is not dict:
-        raise InvalidProblem(
-            "an entry is not an object", where, f"give objects with the keys {', '.join(sorted(keys))}"
-        )
-    unknown = given.keys() - keys
-    if unknown:
-        name = min(unknown)
-        raise InvalidProblem(f"unknown key {name[:40]!r}", where, nearest(name, sorted(keys)))
-    return given
-
-
-def _number(given: Any, where: str) -> float:
-    """Return a finite number of permitted size as a float; raise InvalidProblem with the key `where` otherwise."""
-    # in Python, true is an integer, and an integer of 400 digits is not a float
-    if type(given) is float or (type(given) is int and abs(given) <= LARGEST):
-        value = float(given)
-        if abs(value) <= LARGEST:
-            return value
-    raise InvalidProblem(f"{str(given)[:40]} is not a number up to {LARGEST:g}", where, "give a number")
-
-
-def _values(given: list[Any], site: Site) -> dict[Key, float]:
-    """Return the values of the key "z" by row of the template; null values are left out."""
-    if len(given) != len(site.rows):
-        what = f"there are {len(given)} values, but the site has {len(site.rows)} rows"
-        raise InvalidProblem(what, "z", "give values in the order of the file, null for missing values")
-    return {i: _number(value, "z") for i, value in enumerate(given) if value is not None}
-
-
-def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
-    """Add the value of one row to `rows`, and the standard deviation, if given, to `sigmas`.
-
-    `found` is the entry of the row, with the keys kind, a, b, z and sigma. Raise InvalidProblem for an invalid entry,
-    or for a second value of a row.
-    """
-    if "z" not in found:
-        raise InvalidProblem("a row has no value", "z", "give a number")
-    words = [found.get(key, "") for key in ("kind", "a", "b")]
-    if any(type(word) is not str for word in words):
-        raise InvalidProblem("kind, a and b are names", "rows", "put them in quotes")
-    key = site.find(words[0], words[1], words[2])
-    value = _number(found["z"], "z")
-    if rows.setdefault(key, value) != value:
-        raise InvalidProblem("the line has a row twice", "rows", "send it once")
-    if "sigma" in found:
-        sigma = _number(found["sigma"], "sigma")
-        if sigma <= 0.0:
-            raise InvalidProblem(f"the standard deviation {sigma:g} is not positive", "sigma", "give a positive number")
-        sigmas[key] = sigma
-
-
-def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
-    """Add one arrival to `times`, picoseconds by station number.
-
-    `found` is the entry of the arrival. Raise InvalidProblem for an invalid entry, or for a second time of a station.
-    """
-    station = found.get("station")
-    if not site.arriving:
-        what = "the site has neither toa nor tdoa rows, so it cannot use arrivals"
-        raise InvalidProblem(what, "station", "send values: kind, a, b, z")
-    if type(station) is not str or station not in site.number:
-        raise no_station(str(station)[:40], "station", site.number, UnknownName)
-    given = [key for key in _DIGITS if key in found]
-    if len(given) != 1:
-        raise InvalidProblem("an arrival needs one time", "station", "give time_ns, time_ps or time")
-    value, number = picoseconds(found[given[0]], given[0]), site.number[station]
-    if times.setdefault(number, value) != value:
-        raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one arrival")
-
-
-def rows_and_arrivals(
-    rows: Sequence[Mapping[str, Any]], arrivals: Sequence[Mapping[str, Any]], site: Site
-) -> tuple[dict[Key, float], dict[Key, float], dict[int, int]]:
-    """Return values, standard deviations and arrivals of the entries of a line; errors as in `parse`."""
-    values, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
-    for entry in rows:
-        _row(entry, site, values, sigmas)
-    for entry in arrivals:
-        _arrival(entry, site, times)
-    return values, sigmas, times
-
-
-def name_under(key: str, given: Any) -> str:
-    """Return the name under a key; raise InvalidProblem for an invalid name."""
-    return _text(given, key)
-
-
-def picoseconds(given: Any, key: str) -> int:
-    """Return a time as picoseconds, from an integer, or from a decimal number in quotes.
-
-    `given` is the time in the unit of `key`: "time" (seconds), "time_ns" or "time_ps". Digits below a picosecond (0.3
-    mm) are cut. Raise InvalidProblem for other values, since a float of seconds since 1970 only resolves 70 m.
-    """
-    digits = _DIGITS[key]
-    if type(given) is int and abs(given) < _LATEST:
-        value: int = given * 10**digits
-    elif type(given) is str and (match := _DECIMAL.fullmatch(given)):
-        sign, whole, part = match.groups()
-        value = int(whole) * 10**digits + int(((part or "") + "0" * digits)[:digits] or "0")
-        value = -value if sign == "-" else value
-    else:
-        advice = "send a whole number as time_ns or time_ps, or a decimal number in quotes"
-        raise InvalidProblem(f"{str(given)[:40]} is not an exact time", key, advice)
-    if abs(value) >= _LATEST:
-        raise _beyond_clocks(given, key)
-    return value
-
-
-def _beyond_clocks(given: Any, key: str) -> InvalidProblem:
-    """Return the error for a time under `key` that no clock has; its unit is probably wrong."""
-    return InvalidProblem(f"the time {str(given)[:40]} is out of range", key, "check its unit")
-
-
-# Events: open until they are whole, then answered, then remembered.
+from optloc.service.site import Site, UnknownName
 
 MOST_OPEN = 4096
 """Largest number of open events; beyond, the oldest event closes early."""
 
 REMEMBERED = 65_536
 """Number of closed events whose rows are stored: a minute at a thousand events a second."""
+
+
+OTHER, GONE = 409, 410
+"""HTTP status codes of a repeated id: with other values, and with an answer that is no longer kept."""
+
+
+class RefusedRepeat(InvalidProblem):
+    """A request repeats the id of an event, but cannot have its answer.
+
+    `name` is the name of the event, and `code` is `OTHER` or `GONE`.
+    """
+
+    def __init__(self, what: str, name: str, code: int) -> None:
+        advice = {OTHER: "use another id, or name the client", GONE: "use another id"}[code]
+        super().__init__(what, f"event {shown_name(name)['event'][:40]!r}", advice)
+        self.name, self.code = name, code
 
 
 class Reply(Protocol):
@@ -347,7 +58,7 @@ class Event:
     Parameters
     ----------
     name : str
-        Id of the event.
+        Id of the event, as in `optloc.service.messages.scoped`.
     rows, times, sigmas, target
         As in `Message`.
     first : float
@@ -364,10 +75,16 @@ class Event:
         As in `Message`.
     track : bool
         Whether the answer is the state of a track instead of a fix.
-    reply : Reply, optional
-        Receiver of the answers.
+    replies : list of Reply
+        Receivers of the answers.
+    so_far : dict, optional
+        Answers so far, as one record; None without any, and after the last.
+    answered : bool
+        Whether the event has its last answer.
     refused : str
         Error if a line has a station or a kind that the site does not have; the event is then not solved.
+    lines : dict of str to int
+        Number of its lines by source, which count as open until the event has its last answer.
     """
 
     name: str
@@ -380,10 +97,21 @@ class Event:
     closed: str = ""
     revision: int = 1
     conflict: bool = False
-    reply: Reply | None = None
+    replies: list[Reply] = field(default_factory=list)
+    so_far: dict[str, Any] | None = None
+    answered: bool = False
     when: int | None = None
     track: bool = False
     refused: str = ""
+    lines: dict[str, int] = field(default_factory=dict)
+
+
+def _attach(event: Event, reply: Reply) -> bool:
+    """Give a receiver the answers of an event that is not answered, and return whether it is not answered."""
+    if not event.answered and reply not in event.replies:
+        event.replies.append(reply)
+        reply.expect()
+    return not event.answered
 
 
 @dataclass(slots=True)
@@ -406,6 +134,10 @@ class Events:
         Number of this process and number of processes: each answers a share of the events.
     most : int
         Largest number of open events.
+    attach : callable
+        Gives a receiver the answers of an event; returns False if they are gone. See `optloc.service.replies`.
+    revision : int
+        Revision of the first answer of an event: 1, and one more for each start after a kill.
     """
 
     site: Site
@@ -415,6 +147,8 @@ class Events:
     revise: bool = False
     part: tuple[int, int] = (0, 1)
     most: int = MOST_OPEN
+    attach: Callable[[Event, Reply], bool] = _attach
+    revision: int = 1
     open: dict[str, Event] = field(default_factory=dict)
     # None: an id from a checkpoint, without rows
     closed: dict[str, Event | None] = field(default_factory=dict)
@@ -424,38 +158,43 @@ class Events:
 
     def take(
         self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
-    ) -> None:
+    ) -> Event | str:
         """Add the rows of a line to its event, and close the event if it is whole.
 
+        Return the event that answers the line. Without such an event, return the state of the line in the account:
+        "answered" for rows that repeat an answered event, otherwise "dropped".
+
         `now` is the time of reading by the monotonic clock, s; `when` is the time of reading by the clock for which
-        events wait, s. `reply` receives the answers unless the event already has a receiver. With `track`, a new event
-        is answered by the state of its track. If another process answers the event, the rows are only counted. If the
-        event is already closed, the rows are late or repeated.
+        events wait, s. `reply` receives the answers. With `track`, a new event is answered by the state of its track.
+        If another process answers the event, the rows are only counted. If the event is already closed, the rows are
+        late or repeated. Raise RefusedRepeat for a line with a receiver that differs from the event of its id.
         """
         counts = self.metrics.counts
         size = len(message.rows) + len(message.times)
         counts["rows"] += size
         if self.part[1] > 1 and share_of(message.event, self.part[1]) != self.part[0]:
             counts["elsewhere"] += size
-            return
+            return "dropped"
         event = self.open.get(message.event)
         if event is None:
             if message.event in self.closed:
-                self._after(message, now)
-                return
+                return self._after(message, now, reply, track=track)
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
-            event.when, event.track = message.when, track
+            event.when, event.track, event.revision = message.when, track, self.revision
             self._wait_for(event, reply)
             if message.whole:
                 self._close(event, "whole", now)
-                return
+                return event
             self._open(event, now)
         else:
+            if reply is not None:
+                self._refuse_other(event, message, track=track)
             self._join(event, message)
             self._wait_for(event, reply)
         if message.whole or self._is_whole(event):
             self.open.pop(event.name, None)
             self._close(event, "whole", now)
+        return event
 
     def refuse(self, error: UnknownName, now: float, when: float, *, track: bool = False) -> None:
         """Reject the event of a line with an unknown station or kind, if other lines also belong to the event.
@@ -470,7 +209,7 @@ class Events:
         if event is None:
             if error.whole or not error.event or error.event in self.closed:
                 return
-            event = Event(error.event, {}, {}, when, now, track=track)
+            event = Event(error.event, {}, {}, when, now, track=track, revision=self.revision)
             self._open(event, now)
         event.refused = event.refused or str(error)
         if error.whole:
@@ -544,10 +283,32 @@ class Events:
         return len(event.rows) >= len(site.rows) and all(i in event.rows for i in range(len(site.rows)))
 
     def _wait_for(self, event: Event, reply: Reply | None) -> None:
-        """Give the event a receiver of its answers, if it has none."""
-        if reply is not None and event.reply is None:
-            event.reply = reply
-            reply.expect()
+        """Give the event a receiver of its answers, if there is one; raise RefusedRepeat if its answer is gone."""
+        if reply is not None and not self.attach(event, reply):
+            raise RefusedRepeat("its answer is no longer kept", event.name, GONE)
+
+    def _refuse_other(self, event: Event, message: Message, *, track: bool) -> None:
+        """Raise RefusedRepeat if a line has other values than the event of its id."""
+        other = self._differing(event, message)
+        self.metrics.counts["conflicts"] += len(other)
+        for key in ("target", "when"):
+            given = getattr(message, key)
+            if given not in ("", None) and given != getattr(event, key):
+                other.append({"target": "its target", "when": "its time"}[key])
+        sigmas = message.sigmas or {}
+        if any(event.sigmas.get(key) != sigma for key, sigma in sigmas.items() if key in event.rows):
+            other.append("its sigma")
+        if event.track != track:
+            other.append("its form, fix or track")
+        if other:
+            more = f" and {len(other) - 3} more" if len(other) > 3 else ""
+            raise RefusedRepeat(f"the id is used with other values: {', '.join(other[:3])}{more}", event.name, OTHER)
+
+    def _differing(self, event: Event, message: Message) -> list[str]:
+        """Return the names of the rows and stations of a line that have another value in the event."""
+        site = self.site
+        other = [site.name_of(key) for key, value in message.rows.items() if event.rows.get(key, value) != value]
+        return other + [site.stations[i] for i, value in message.times.items() if event.times.get(i, value) != value]
 
     def _close(self, event: Event, why: str, now: float) -> None:
         """Close an event for the reason `why`, and queue it for its answer."""
@@ -566,33 +327,47 @@ class Events:
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
-    def _after(self, message: Message, now: float) -> None:
-        """Handle rows that arrive after the answer of their event: count them, send notes, or answer again."""
+    def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
+        """Handle rows that arrive after their event has closed: count them, send notes, or answer again.
+
+        A receiver gets the answer of the event; a line with other rows or values is refused. The result is as
+        in `take`.
+        """
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:
             counts["repeated"] += len(message.rows) + len(message.times)
-            return
+            if reply is not None:
+                raise RefusedRepeat("its answer is no longer kept", message.event, GONE)
+            return "answered"
+        if reply is not None:
+            self._refuse_other(event, message, track=track)
         site = self.site
         late = [site.name_of(key) for key in message.rows if key not in event.rows]
         late += [site.stations[i] for i in message.times if i not in event.times]
-        other = [site.name_of(key) for key, value in message.rows.items() if event.rows.get(key, value) != value]
-        other += [site.stations[i] for i, value in message.times.items() if event.times.get(i, value) != value]
+        other = self._differing(event, message)
         counts["conflicts"] += len(other)
         counts["repeated"] += len(message.rows) + len(message.times) - len(late) - len(other)
         counts["late"] += len(late)
         if other:
-            self.note({"event": event.name, "note": "conflict", "rows": other})
+            self.note({**shown_name(event.name), "note": "conflict", "rows": other})
         if late and not self.revise:
-            self.note({"event": event.name, "note": "late", "rows": late})
+            self.note({**shown_name(event.name), "note": "late", "rows": late})
+            if reply is not None:
+                raise RefusedRepeat(f"it is answered without {', '.join(late[:3])}", event.name, OTHER)
         if late and self.revise:
             again = Event(
                 event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
                 {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
-                "late", event.revision + 1, event.conflict or bool(other), None, event.when, event.track, event.refused,
+                "late", event.revision + 1, event.conflict or bool(other), when=event.when, track=event.track,
+                refused=event.refused,
             )  # fmt: skip
             counts["revisions"] += 1
             self.closed[event.name] = again
             self.ready.append(again)
+            self._wait_for(again, reply)
+            return again
+        self._wait_for(event, reply)
+        return "dropped" if late or other else "answered"
 
 
 def share_of(event: str, count: int) -> int:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from optloc.problem import Array
+from optloc.service.account import SETTLED, Account
+from optloc.service.alarms import Alarm
 
 # Number of stored latencies per phase: the last seconds under load, the last minute at 64 answers a second.
 _LATENCIES = 4096
@@ -32,6 +34,7 @@ COUNTS = {
     "dropped": "messages of a broker dropped because the input queue was full",
     "refused": "requests refused because the input queue was full",
     "unsolvable": "events whose rows give no problem, or have names that the site does not have",
+    "unwritable": "answers that could not be written in the output format, or passed to a receiver",
     "tracked": "events used in a track",
     "unordered": "events refused because a later event of their track came first",
     "forgotten": "tracks removed: no events for too long, too many tracks, or failed",
@@ -44,7 +47,10 @@ class Metrics:
 
     counts: counts by the names in `COUNTS`. statuses: number of last answers by status. proofs: number of proofs by
     outcome. tracks: number of events of tracks by status. heard: time of the last row of each station by the clock of
-    the stream, s. gauges: functions that return the present length of each queue.
+    the stream, s. gauges: functions that return the present length of each queue. account: lines by source and state.
+    alarms: functions that return the alarm of each part, by the kind of the part ("source" or "output") and its name.
+    restarts: functions that return the number of restarts of each source. losses: functions that return the number of
+    dropped entries of each side output.
     """
 
     def __init__(self) -> None:
@@ -58,6 +64,10 @@ class Metrics:
         self._answers: Counter[str] = Counter()
         self.heard: dict[str, float] = {}
         self.gauges: dict[str, Callable[[], int]] = {}
+        self.account = Account()
+        self.alarms: dict[tuple[str, str], Callable[[], Alarm | None]] = {}
+        self.restarts: dict[str, Callable[[], int]] = {}
+        self.losses: dict[str, Callable[[], int]] = {}
 
     def add(self, name: str, count: int = 1) -> None:
         """Add to a count."""
@@ -96,6 +106,15 @@ class Metrics:
             values = self._latency[phase][:count].copy()
         return np.quantile(values, [0.5, 0.99]) if count else np.full(2, np.nan)
 
+    def active(self, now: float) -> list[dict[str, Any]]:
+        """Return the present alarms: kind and name of the part, its error, and the seconds since which it fails."""
+        found = [(kind, name, alarm()) for (kind, name), alarm in list(self.alarms.items())]
+        return [
+            {"part": kind, "name": name, "error": alarm.error, "seconds": round(now - alarm.since, 3)}
+            for kind, name, alarm in found
+            if alarm is not None
+        ]
+
     def health(self, now: float, about: Mapping[str, Any]) -> dict[str, Any]:
         """Return all counts and latencies as a record.
 
@@ -109,6 +128,8 @@ class Metrics:
                 "proofs": dict(self.proofs),
                 "tracks": dict(self.tracks),
             }
+        out["account"], out["alarms"] = self.account.records(), self.active(now)
+        out["dropped_by_output"] = {name: count() for name, count in list(self.losses.items())}
         out["queues"] = {name: depth() for name, depth in self.gauges.items()}
         for phase in PHASES:
             p50, p99 = self.percentiles(phase)
@@ -131,6 +152,7 @@ class Metrics:
             label = "proof" if key == "proofs" else "status"
             lines += [f"# HELP optloc_{name} {meaning}", f"# TYPE optloc_{name} counter"]
             lines += [f'optloc_{name}{{{label}="{_label(word)}"}} {n}' for word, n in sorted(found[key].items())]
+        lines += self._account_text(found["account"]) + self._alarm_text(found)
         lines += ["# HELP optloc_queue_depth waiting entries", "# TYPE optloc_queue_depth gauge"]
         lines += [f'optloc_queue_depth{{queue="{name}"}} {depth}' for name, depth in found["queues"].items()]
         lines += [
@@ -151,6 +173,44 @@ class Metrics:
             for name, seconds in found["seconds_since_row"].items()
         ]
         return "\n".join(lines) + "\n"
+
+    def _account_text(self, account: Mapping[str, Mapping[str, int]]) -> list[str]:
+        """Return the account in the text format of Prometheus."""
+        lines = [
+            "# HELP optloc_source_lines_total lines by source; received = answered + refused + dropped + open",
+            "# TYPE optloc_source_lines_total counter",
+        ]
+        for source, counts in sorted(account.items()):
+            for state in ("received", *SETTLED):
+                labels = f'source="{_label(source)}",state="{state}"'
+                lines.append(f"optloc_source_lines_total{{{labels}}} {counts[state]}")
+        lines += ["# HELP optloc_open_lines lines that wait for their answers", "# TYPE optloc_open_lines gauge"]
+        lines += [
+            f'optloc_open_lines{{source="{_label(source)}"}} {n["open"]}' for source, n in sorted(account.items())
+        ]
+        return lines
+
+    def _alarm_text(self, found: Mapping[str, Any]) -> list[str]:
+        """Return alarms, restarts and losses of outputs in the text format of Prometheus; `found` is the health."""
+        active = {(each["part"], each["name"]) for each in found["alarms"]}
+        lines = ["# HELP optloc_alarm 1 if a part does not work", "# TYPE optloc_alarm gauge"]
+        lines += [
+            f'optloc_alarm{{part="{part}",name="{_label(name)}"}} {int((part, name) in active)}'
+            for part, name in sorted(self.alarms)
+        ]
+        lines += ["# HELP optloc_restarts_total restarts of a source", "# TYPE optloc_restarts_total counter"]
+        lines += [
+            f'optloc_restarts_total{{source="{_label(name)}"}} {n()}' for name, n in sorted(self.restarts.items())
+        ]
+        lines += [
+            "# HELP optloc_output_dropped_total entries that a side output dropped",
+            "# TYPE optloc_output_dropped_total counter",
+        ]
+        lines += [
+            f'optloc_output_dropped_total{{output="{_label(name)}"}} {count}'
+            for name, count in sorted(found["dropped_by_output"].items())
+        ]
+        return lines
 
 
 def _ms(seconds: float) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from optloc.files import Draft, draft, read_bytes
 from optloc.models import MODELS
+from optloc.service.adapters import Adapter, converted
 from optloc.service.queues import QueuedLine
 from optloc.service.stream import Stream
 
@@ -82,11 +83,13 @@ def _turned(kind: str) -> bool:
     return model.stations > 1 and not (model.ranges is not None and sum(model.ranges) > 1)
 
 
-def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: str) -> None:
-    """Pass the lines of a recording to a stream, and close the stream at the end.
+def replay(
+    recording: Sequence[Recorded], stream: Stream, speed: float, source: str, adapter: Adapter | None = None
+) -> None:
+    """Pass the lines of a recording to a stream until the end of the recording or of the stream.
 
     `speed` is the replay speed relative to the recording; infinity: as fast as the stream answers. `source` is the name
-    of the recording for messages.
+    of the recording for messages. `adapter` converts recorded lines to lines of a stream.
     """
     # `when` is the time of reading of the last line that has one. `never` is not set: its wait is a sleep.
     began, first, when, never = stream.clock(), np.nan, 0.0, Event()
@@ -103,6 +106,6 @@ def replay(recording: Sequence[Recorded], stream: Stream, speed: float, source: 
         if stream.inbox.closed:
             return
         when = when if np.isnan(received) else received
-        waiting.append(QueuedLine(data, number, source, stream.clock(), when))
+        line, fault = converted(adapter, data)
+        waiting.append(QueuedLine(line, number, source, stream.clock(), when, fault=fault))
     stream.inbox.put(waiting)
-    stream.close()

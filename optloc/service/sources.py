@@ -1,146 +1,101 @@
-"""Further sources of lines: MQTT and ZeroMQ, and adapters for the formats of gateways and receivers."""
+"""Sources of lines: standard input, and the brokers MQTT and ZeroMQ."""
 
 from __future__ import annotations
 
-import json
-import logging
 import os
-from collections.abc import Callable, Collection, Mapping
-from threading import Thread
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from optloc.problem import InvalidProblem, nearest
-from optloc.service.events import LINE
+from optloc.problem import InvalidProblem
+from optloc.service.adapters import Adapter
+from optloc.service.alarms import SourceLost
+from optloc.service.messages import LINE
 from optloc.service.queues import WAITING
 from optloc.service.stream import Stream
+from optloc.service.supervisor import LineSource, Watch
 
-LOG = logging.getLogger("optloc.service")
+# Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
+# written together then stay together at any reading speed, and events with missing rows still close.
+_UNCOUNTED = 0.98
+# Restarts of a failing standard input: an error of a terminal may pass, an error of a device does not.
+_TRIES = 3
+# Seconds between two looks at whether a source must end.
+_LOOK = 0.2
+# Seconds after which MQTT asks a silent broker whether it is still there.
+_KEEPALIVE = 30
 
-Adapter = Callable[[bytes], bytes]
-"""Converts a line of another format to a line of a stream; it returns other lines unchanged, for an error message."""
 
-# Formats of other systems.
+def standard_input(
+    stream: Stream,
+    read: Callable[[int], bytes],
+    adapter: Adapter | None = None,
+    pending: Callable[[], bool] = bool,
+) -> LineSource:
+    """Return standard input as a source, with whose end the stream ends; the arguments are as in `read_lines`."""
+
+    def run(watch: Watch) -> None:
+        """Read standard input until its end."""
+
+        def watched(count: int) -> bytes:
+            data = read(count)
+            watch.works()
+            return data
+
+        read_lines(watched, stream, watch.name, adapter, pending)
+
+    return LineSource("stdin", run, is_last=True, tries=_TRIES)
 
 
-class ChirpStack:
-    """Adapter for uplinks of ChirpStack (version 4, JSON) from gateways with fine timestamps.
+def read_lines(
+    read: Callable[[int], bytes],
+    stream: Stream,
+    source: str,
+    adapter: Adapter | None = None,
+    pending: Callable[[], bool] = bool,
+) -> None:
+    """Read lines until the end and pass them to a stream; while the queue is full, nothing is read.
 
-    The event is the deduplication id, the target is the device. Gateways of other networks may receive a device as
-    well: gateways that the site does not have are left out, with one warning for each. `stations` are the ids of the
-    gateways of the site.
+    Parameters
+    ----------
+    read : callable
+        Returns at most the given number of bytes, as soon as any are available; empty at the end.
+    stream : Stream
+        Receives the lines.
+    source : str
+        Name of the source for messages.
+    adapter : callable, optional
+        Converts input lines to lines of a stream.
+    pending : callable
+        Returns whether input is available: then the time between two reads hardly counts for waiting events.
     """
-
-    def __init__(self, stations: Collection[str]) -> None:
-        self._stations = frozenset(stations)
-        self._foreign: set[str] = set()
-
-    def __call__(self, line: bytes) -> bytes:
-        """Return an uplink as a line with a whole event; lines of another form are returned unchanged."""
-        found = _object(line)
-        if found is None or not isinstance(found.get("rxInfo"), list):
-            return line
-        every = [each for each in found["rxInfo"] if isinstance(each, dict) and isinstance(each.get("gatewayId"), str)]
-        receptions = [each for each in every if each["gatewayId"] in self._stations]
-        self._warn({each["gatewayId"] for each in every} - self._stations)
-        arrivals = [
-            {"station": each["gatewayId"], "time": str(each["fineTimeSinceGpsEpoch"]).removesuffix("s")}
-            for each in receptions
-            if each.get("fineTimeSinceGpsEpoch") is not None
-        ]
-        device = found.get("deviceInfo")
-        target = device.get("devEui") if isinstance(device, dict) else None
-        event = {"event": found.get("deduplicationId"), "arrivals": arrivals} | ({"target": target} if target else {})
-        return json.dumps(event).encode()
-
-    def _warn(self, foreign: set[str]) -> None:
-        """Log a warning for each gateway that the site does not have, once."""
-        for name in sorted(foreign - self._foreign) if len(self._foreign) < _MESSAGES else ():
-            self._foreign.add(name)
-            LOG.warning("gateway %r is not a station of the site: its arrivals are left out", name[:40])
-
-
-# Largest time between receptions of one transmission, ns, and number of remembered messages. Equal bits are repeated
-# after tenths of a second.
-_TOGETHER, _MESSAGES = 5_000_000, 4096
-# A day in nanoseconds: the clocks of these receivers restart at midnight.
-_DAY = 86_400 * 10**9
-
-
-class ModeS:
-    """Adapter for messages of mlat-client, with the name of the `receiver` added.
-
-    A message is ``{"mlat": {"t": ..., "m": "8d..."}}``.
-
-    The clocks of the receivers must be synchronised: `t` is in nanoseconds since midnight, as with GPS receivers
-    (``radarcape_gps``). Equal messages within 5 ms are one event. An address in the message becomes the target.
-    `stations` are the names of the receivers.
-    """
-
-    def __init__(self, stations: Collection[str]) -> None:
-        self._stations = frozenset(stations)
-        # by message: time of the first reception, ns, and the number of earlier events with the same message
-        self._seen: dict[str, tuple[int, int]] = {}
-
-    def __call__(self, line: bytes) -> bytes:
-        """Return a message as a line with one arrival; lines of another form are returned unchanged."""
-        found = _object(line)
-        reception = None if found is None else found.get("mlat")
-        if found is None or not isinstance(reception, dict):
-            return line
-        bits, time, station = reception.get("m"), reception.get("t"), found.get("receiver")
-        if not isinstance(bits, str) or type(time) is not int:
-            return line
-        first, number = self._seen.pop(bits, (time, 0))
-        # nanoseconds since midnight start again each day, so the delay is within half a day of zero
-        delay = (time - first + _DAY // 2) % _DAY - _DAY // 2
-        if abs(delay) > _TOGETHER:
-            first, number, delay = time, number + 1, 0
-        self._seen[bits] = first, number
-        if len(self._seen) > _MESSAGES:
-            del self._seen[next(iter(self._seen))]
-        # relative to the midnight of the first receiver, so that midnight does not split an event
-        event = {"event": f"{bits}-{number}", "station": station, "time_ns": first + delay}
-        address = _address(bits)
-        return json.dumps(event | ({"target": address} if address else {})).encode()
-
-
-def _address(bits: str) -> str:
-    """Return the address in a Mode S message of format 11, 17 or 18; empty for other formats."""
+    rest, number, last = b"", 0, stream.clock()
+    stream.pending = pending
     try:
-        kind = int(bits[:2], 16) >> 3
-    except ValueError:
-        return ""
-    return bits[2:8].lower() if kind in (11, 17, 18) else ""
-
-
-def _object(line: bytes) -> dict[str, Any] | None:
-    """Return the JSON object of a line; None if it is too long or is not an object."""
-    if len(line) > 4 * LINE:  # an uplink has many parts that are not used
-        return None
-    try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
-ADAPTERS: Mapping[str, Callable[[Collection[str]], Adapter]] = {"chirpstack": ChirpStack, "mode-s": ModeS}
-"""Adapters by name."""
-
-
-def adapter_of(name: str, stations: Collection[str]) -> Adapter:
-    """Return the adapter for a format by name; raise InvalidProblem for an unknown format."""
-    if name not in ADAPTERS:
-        raise InvalidProblem(f"there is no format {name!r}", "--adapter", nearest(name, ADAPTERS))
-    return ADAPTERS[name](stations)
+        while True:
+            waited = pending()  # then the input waits for this thread, not this thread for the input
+            if not (piece := read(LINE)):
+                break
+            now = stream.clock()
+            stream.held += _UNCOUNTED * (now - last) if waited else 0.0
+            last = now
+            *whole, rest = (rest + piece).split(b"\n")
+            if len(rest) > 2 * LINE:
+                rest = rest[: LINE + 1]  # the beginning suffices to reject a line that is too long
+            stream.inbox.put(stream.lines(whole, source, number + 1, adapter=adapter))
+            number += len(whole)
+            if stream.inbox.closed:
+                return
+    finally:
+        stream.pending = bool
+    stream.inbox.put(stream.lines([rest], source, number + 1, adapter=adapter))
 
 
 # Brokers.
 
 
-def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callable[[], None]:
-    """Read the messages of a topic of an MQTT broker, and return a function that stops it.
+def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
+    """Return the messages of a topic of an MQTT broker as a source; the broker must be present now.
 
     If too many messages wait, the oldest are dropped and counted. `address` is ``mqtt://user@host:1883/topic``, or
     ``mqtts`` with TLS; the topic may have wildcards. The variable OPTLOC_MQTT_PASSWORD has the password. `adapter`
@@ -149,7 +104,6 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     """
     try:
         from paho.mqtt import client as paho
-        from paho.mqtt.enums import CallbackAPIVersion
     except ImportError:
         raise InvalidProblem("MQTT needs paho-mqtt", "--mqtt", "pip install 'optloc[live-mqtt]'") from None
     parts = urlsplit(address)
@@ -157,59 +111,69 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> Callab
     topic = unquote(parts.path[1:] + (f"#{parts.fragment}" if "#" in address else ""))
     if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname or not topic:
         raise InvalidProblem(f"{address!r} is not an address of a topic", "--mqtt", "write mqtt://host:1883/topic")
+    try:
+        opened = [_mqtt_client(parts)]
+    except (OSError, ValueError) as error:
+        raise InvalidProblem(f"the broker cannot be reached ({error})", "--mqtt", "check host and port") from None
+    number = 0
+
+    def run(watch: Watch) -> None:
+        """Receive messages until the source is stopped; raise SourceLost if the connection is lost."""
+        client, refusal = opened.pop() if opened else _mqtt_client(parts), list[str]()
+
+        def connected(client: Any, _: Any, __: Any, reason: Any, ___: Any) -> None:
+            """Subscribe to the topic after each connection."""
+            if reason.is_failure:
+                refusal.append(f"the broker refuses ({reason})")
+            else:
+                client.subscribe(topic, qos=1)
+                watch.works()
+
+        def receive(_: Any, __: Any, message: Any) -> None:
+            """Pass the lines of a message to the stream."""
+            nonlocal number
+            number = _push(stream, message.payload, "mqtt", number, adapter)
+
+        client.on_connect, client.on_message = connected, receive
+        while not watch.stopping.is_set():
+            code = client.loop(_LOOK)
+            if refusal or code != paho.MQTT_ERR_SUCCESS:
+                raise SourceLost(refusal[0] if refusal else f"the broker is lost ({paho.error_string(code)})")
+        client.disconnect()
+
+    return LineSource("mqtt", run)
+
+
+def _mqtt_client(parts: Any) -> Any:
+    """Return a client that connects to the broker of a split address; raise OSError if the broker is not there."""
+    from paho.mqtt import client as paho
+    from paho.mqtt.enums import CallbackAPIVersion
+
     # Version 2 of the callbacks: version 1 will be removed in the next release.
     client = paho.Client(CallbackAPIVersion.VERSION2)
     if parts.scheme == "mqtts":
         client.tls_set()
     if parts.username:
         client.username_pw_set(unquote(parts.username), os.environ.get("OPTLOC_MQTT_PASSWORD"))
-    number = 0
-
-    def connected(client: Any, _: Any, __: Any, reason: Any, ___: Any) -> None:
-        """Subscribe to the topic after each connection, or log a warning if the broker refuses."""
-        if reason.is_failure:
-            LOG.warning("%s: the broker refuses (%s)", parts.hostname, reason)
-        else:
-            client.subscribe(topic, qos=1)  # again after each reconnection
-
-    def receive(_: Any, __: Any, message: Any) -> None:
-        """Pass the lines of a message to the stream."""
-        nonlocal number
-        number = _push(stream, message.payload, "mqtt", number, adapter)
-
-    client.on_connect, client.on_message = connected, receive
-    try:
-        client.connect(parts.hostname, parts.port or (8883 if parts.scheme == "mqtts" else 1883))
-    except (OSError, ValueError) as error:
-        raise InvalidProblem(f"the broker cannot be reached ({error})", "--mqtt", "check host and port") from None
-    client.loop_start()
-
-    def stop() -> None:
-        """Disconnect from the broker, and end the thread of the client."""
-        client.disconnect()
-        client.loop_stop()
-
-    return stop
+    client.connect(parts.hostname, parts.port or (8883 if parts.scheme == "mqtts" else 1883), _KEEPALIVE)
+    return client
 
 
 def _push(stream: Stream, payload: bytes, source: str, number: int, adapter: Adapter | None) -> int:
     """Pass the lines of a message to a stream without waiting, and return the number of the last line.
 
-    `number` is the number of the last line of the messages before. Old lines that the full queue drops are counted.
+    `number` is the number of the last line of the messages before. Lines that the full queue drops are counted.
     """
-    for data in payload.split(b"\n"):
-        if not data.strip():
-            continue
-        number += 1
-        (line,) = stream.lines([adapter(data) if adapter else data], source, number)
+    lines = [data for data in payload.split(b"\n") if data.strip()]
+    for line in stream.lines(lines, source, number + 1, adapter=adapter):
         dropped = stream.inbox.push(line)
         if dropped:
             stream.metrics.add("dropped", dropped)
-    return number
+    return number + len(lines)
 
 
-def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Callable[[], None]:
-    """Read the messages of a ZeroMQ socket, and return a function that stops it.
+def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
+    """Return the messages of a ZeroMQ socket as a source.
 
     ``tcp://host:5555`` subscribes to a publisher; if too many messages wait, the oldest are dropped.
     ``pull+tcp://127.0.0.1:5555`` listens; if too many messages wait, the senders wait. `adapter` converts messages to
@@ -220,47 +184,71 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Call
     except ImportError:
         raise InvalidProblem("ZeroMQ needs pyzmq", "--zmq", "pip install 'optloc[live-zmq]'") from None
     pulls = address.startswith("pull+")
-    context: Any = zmq.Context()
-    socket = context.socket(zmq.PULL if pulls else zmq.SUB)
-    # Limit the size of a message from the network to the size of a request.
-    socket.setsockopt(zmq.MAXMSGSIZE, 16 * LINE)
-    socket.setsockopt(zmq.RCVHWM, WAITING)
-    socket.setsockopt(zmq.LINGER, 0)
     try:
+        opened = [_zeromq_sockets(address)]
+    except zmq.ZMQError as error:
+        advice = "write tcp://host:5555, or pull+tcp://127.0.0.1:5555"
+        raise InvalidProblem(f"{address!r} cannot be used ({error.strerror})", "--zmq", advice) from None
+    number = 0
+
+    def run(watch: Watch) -> None:
+        """Receive messages until the source is stopped, and pass their lines to the stream."""
+        nonlocal number
+        context, socket, monitor = opened.pop() if opened else _zeromq_sockets(address)
+        try:
+            while not watch.stopping.is_set():
+                ready = zmq.select([socket, monitor], [], [], _LOOK)[0]
+                if monitor in ready:
+                    _note_event(monitor, watch, pulls=pulls)
+                if socket not in ready:
+                    continue
+                payload = socket.recv_multipart()[-1]
+                if pulls:
+                    lines = [data for data in payload.split(b"\n") if data.strip()]
+                    stream.inbox.put(stream.lines(lines, "zmq", number + 1, adapter=adapter))
+                    number += len(lines)
+                else:
+                    number = _push(stream, payload, "zmq", number, adapter)
+        finally:
+            context.destroy(0)  # a socket must be closed in its thread
+
+    return LineSource("zmq", run)
+
+
+def _zeromq_sockets(address: str) -> tuple[Any, Any, Any]:
+    """Return a context, a connected socket, and a socket that reports its connections; raise ZMQError otherwise."""
+    import zmq
+
+    pulls = address.startswith("pull+")
+    context: Any = zmq.Context()
+    try:
+        socket = context.socket(zmq.PULL if pulls else zmq.SUB)
+        # Limit the size of a message from the network to the size of a request.
+        socket.setsockopt(zmq.MAXMSGSIZE, 16 * LINE)
+        socket.setsockopt(zmq.RCVHWM, WAITING)
+        socket.setsockopt(zmq.LINGER, 0)
+        monitor = socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED | zmq.EVENT_DISCONNECTED)
         if pulls:
             socket.bind(address.removeprefix("pull+"))
         else:
             socket.connect(address)
             socket.setsockopt(zmq.SUBSCRIBE, b"")
-    except zmq.ZMQError as error:
+    except zmq.ZMQError:
         context.destroy(0)
-        advice = "write tcp://host:5555, or pull+tcp://127.0.0.1:5555"
-        raise InvalidProblem(f"{address!r} cannot be used ({error.strerror})", "--zmq", advice) from None
-    ends = False
+        raise
+    return context, socket, monitor
 
-    def run() -> None:
-        """Receive messages until the source is stopped (a separate thread), and pass their lines to the stream."""
-        number = 0
-        while not ends:
-            if not socket.poll(200):
-                continue
-            payload = socket.recv_multipart()[-1]
-            if pulls:
-                lines = [adapter(data) if adapter else data for data in payload.split(b"\n") if data.strip()]
-                stream.inbox.put(stream.lines(lines, "zmq", number + 1))
-                number += len(lines)
-            else:
-                number = _push(stream, payload, "zmq", number, adapter)
-        # a socket must be closed in its thread
-        context.destroy(0)
 
-    thread = Thread(target=run, name="optloc zmq", daemon=True)
-    thread.start()
+def _note_event(monitor: Any, watch: Watch, *, pulls: bool) -> None:
+    """Start or end the alarm of a ZeroMQ source by one event of its connections.
 
-    def stop() -> None:
-        """Stop the source, and wait at most 5 s for its end."""
-        nonlocal ends
-        ends = True
-        thread.join(5.0)
+    ZeroMQ connects again by itself. Senders of a socket that listens (`pulls`) may come and go.
+    """
+    import zmq
+    from zmq.utils.monitor import recv_monitor_message
 
-    return stop
+    event = recv_monitor_message(monitor)["event"]
+    if event == zmq.EVENT_CONNECTED:
+        watch.works()
+    elif not pulls:
+        watch.fails("the publisher is lost" if event == zmq.EVENT_DISCONNECTED else "no publisher answers")

@@ -1,7 +1,7 @@
 """A stream: lines from all sources go through one bounded queue; one thread answers, one thread writes.
 
 The thread that answers parses lines, collects events, closes them in time, and passes them to the engine. It also
-writes checkpoints, recordings and health.
+makes checkpoints, recordings and health, which other threads write.
 """
 
 from __future__ import annotations
@@ -11,22 +11,27 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event as Flag, Lock, Thread
 from time import monotonic
+from typing import Any
 
-import numpy as np
-
-from optloc.engine import enabled, simulate
-from optloc.files import GrowingFile, access, write_text
-from optloc.problem import InvalidProblem
-from optloc.service import events as of_events
-from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
-from optloc.service.checkpoint import restore, state_of
-from optloc.service.engine import BATCH, Engine
-from optloc.service.events import LINE, Events, parse
+from optloc.engine import enabled
+from optloc.files import access
+from optloc.service.account import total
+from optloc.service.adapters import Adapter, converted
+from optloc.service.alarms import Alarm, SourceLost, sentence
+from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_feed, to_line
+from optloc.service.checkpoint import state_of
+from optloc.service.engine import BATCH, Engine, warm_up
+from optloc.service.events import Event, Events, RefusedRepeat
+from optloc.service.messages import parse, shown_name
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
+from optloc.service.replies import Replies
+from optloc.service.side_outputs import SideOutput
 from optloc.service.site import Site, UnknownName, read_site
+from optloc.service.stream_files import StreamFiles
+from optloc.service.supervisor import LineSource, Supervisor, Watch
 from optloc.service.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.service")
@@ -35,11 +40,10 @@ LOG = logging.getLogger("optloc.service")
 _LINES = 256
 # Seconds between checks of whether a reader has read its available input.
 _PAUSE = 1e-3
-# Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
-# written together then stay together at any reading speed, and events with missing rows still close.
-_UNCOUNTED = 0.98
-# Bytes of a recording that are collected before writing.
-_RECORD_BUFFER = 1 << 16
+# Seconds between writes of the recording.
+_RECORD_EVERY = 1.0
+# Lines of an event whose lines are settled. It is shared, since many events are remembered, and never modified.
+_NO_LINES: dict[str, int] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,30 +129,40 @@ class Stream:
     ) -> None:
         self.site, self._settings, self._say, self.clock, self._again = site, settings, say, clock, again
         self._replayed = replayed
-        self.metrics, self.latest, self.inbox = Metrics(), Latest(), Inbox()
+        self.metrics, self.latest = Metrics(), Latest()
+        self.inbox = Inbox(account=self.metrics.account)
+        self.sources = Supervisor(self.close, self._emit, clock, self._watch)
         # replaced, never modified, because threads iterate over it
         self.listeners: tuple[Callable[[Record], None], ...] = ()
         # for a source that is a file: seconds that do not count for waiting, and whether it has more to read
         self.held = 0.0
         self.pending: Callable[[], bool] = bool
-        self._outbox = Outbox(write, self.inbox.close)
+        self._outbox = Outbox(write, self.inbox.close, self._settle)
         self._format = FORMATS[settings.format]
         self._engine = self._new_engine(site)
-        self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
-        self._unwritten: dict[str, of_events.Event] = {}  # closed events whose last answer may not be written yet
-        # before other files are created, since a rejected checkpoint must leave none behind
-        if settings.state is not None and settings.state.exists():
-            restore(settings.state, self._events, self._time())
-        self._record = None if settings.record is None else GrowingFile(settings.record)
-        self._recorded = bytearray()  # lines that are not yet in the file of the recording
+        self._replies = Replies()
+        self._events = Events(
+            site, self.metrics, self._emit, settings.wait, settings.revise, settings.part, attach=self._replies.attach
+        )
+        # closed events whose last answer may not be written yet, by identity, since an event may be answered twice
+        self._unsettled: dict[int, Event] = {}
+        self._settling = Lock()
+        self._imbalance: Alarm | None = None
+        self._files = StreamFiles(settings.state, settings.record, self._events, self._time(), say)
+        for output in self._files.outputs:
+            self.watch_output(output)
+        # before the first answer, so that the answers after a kill have higher revisions
+        self._files.checkpoint(self._state, waits=True)
         self._reload = False
-        self._next_state, self._next_health = clock() + settings.every, clock() + settings.health
+        now = clock()
+        self._next_state, self._next_health, self._next_record = now + settings.every, now + settings.health, now
         self.metrics.gauges |= {
             "input": lambda: len(self.inbox),
             "output": lambda: len(self._outbox),
             "open": lambda: len(self._events.open),
         }
-        self.ended = Event()
+        self.metrics.alarms["account", "lines"] = lambda: self._imbalance
+        self.ended = Flag()
         self.error: Exception | None = None
         warm_up(site, settings.phases)
         Thread(target=self._run, name="optloc stream", daemon=True).start()
@@ -177,10 +191,29 @@ class Stream:
         ticket: Ticket | None = None,
         *,
         track: bool | None = None,
+        adapter: Adapter | None = None,
     ) -> list[QueuedLine]:
-        """Return data that was just read as lines, numbered from `first`; `track` is as in `QueuedLine`."""
+        """Return data that was just read as lines, numbered from `first`, without blank lines of a pipe.
+
+        `track` is as in `QueuedLine`. `adapter` converts the lines; a line on which it fails is refused later.
+        """
         now, when = self.clock(), self._time()
-        return [QueuedLine(each, first + i, source, now, when, ticket, track) for i, each in enumerate(data)]
+        found = [(i, *converted(adapter, each)) for i, each in enumerate(data, first) if ticket or each.strip()]
+        return [QueuedLine(each, i, source, now, when, ticket, track, fault) for i, each, fault in found]
+
+    def start(self, source: LineSource) -> None:
+        """Read a source in a separate thread, and again after an error."""
+        self.sources.start(source)
+
+    def _watch(self, watch: Watch) -> None:
+        """Show the state of a source in health and metrics."""
+        self.metrics.alarms["source", watch.name] = lambda: watch.alarm
+        self.metrics.restarts[watch.name] = lambda: watch.restarts
+
+    def watch_output(self, output: SideOutput[Any]) -> None:
+        """Show the state of a side output in health and metrics."""
+        self.metrics.alarms["output", output.name] = lambda: output.alarm
+        self.metrics.losses[output.name] = lambda: output.dropped
 
     @property
     def tracks(self) -> Tracks:
@@ -225,16 +258,28 @@ class Stream:
             self._loop()
         except Exception as error:  # noqa: BLE001  # raised in the thread that waits for the stream
             self.error = error
+        try:
+            self._end()
+        except Exception as error:  # noqa: BLE001  # as above
+            self.error = self.error or error
         finally:
-            self.inbox.close()
-            self._outbox.close()
             self.ended.set()
+
+    def _end(self) -> None:
+        """Drop the lines that are still waiting, write the last state and the rest of the recording, and end."""
+        self.inbox.close()
+        self.inbox.drop()
+        self._outbox.close()
+        self._check_account()
+        ended = self.error is None and not self._outbox.failed
+        self._files.checkpoint(lambda: self._state(ended=ended))
+        self._files.close()
 
     def _loop(self) -> None:
         """Read lines and answer closed events until the queue of lines is closed or the output fails."""
         while not self._outbox.failed:
             # `due` is the number of seconds until the next timed work. In a replay, only lines close events.
-            due = min(self._engine.next_due, self._next_state, self._next_health) - self.clock()
+            due = min(self._engine.next_due, self._next_state, self._next_health, self._next_record) - self.clock()
             if not self._replayed:
                 due = min(due, self._events.next_due - self._time())
             pending = self.pending()
@@ -264,49 +309,65 @@ class Stream:
             self._reload_site()
         if now >= self._next_health:
             self._next_health = now + self._settings.health
+            self._check_account()
             self._say(json.dumps({"health": self.health()}))
-            self._write_record()
+        if now >= self._next_record:
+            self._next_record = now + _RECORD_EVERY
+            self._files.write_record()
         if now >= self._next_state:
             self._next_state = now + self._settings.every
-            self._checkpoint()
+            self._files.checkpoint(self._state)
 
     def _finish(self) -> None:
-        """Answer all waiting events, and store the last state."""
+        """Answer all waiting events."""
         self._events.flush(self.clock())
         self._answer_closed()
         self._engine.stop()
-        self._outbox.close()
-        self._checkpoint()
-        self._write_record(last=True)
 
     def _read(self, line: QueuedLine) -> None:
         """Read one line: add its rows to an event, or run its command; report an invalid line."""
-        counts, ticket = self.metrics.counts, line.ticket
+        self.metrics.counts["lines"] += 1
+        try:
+            found, reply = self._take(line)
+        except Exception as error:  # noqa: BLE001  # an error of one line must not end the stream
+            found, reply = "refused", self._refuse(line, error)
+        if isinstance(found, Event):
+            found.lines[line.source] = found.lines.get(line.source, 0) + 1
+        else:
+            self.metrics.account.settle(found, {line.source: 1})
+        if line.ticket is not None:
+            line.ticket.handled(reply)
+
+    def _take(self, line: QueuedLine) -> tuple[Event | str, Record | None]:
+        """Return the event that gets the rows of a line, or the state of the line in the account, and its direct reply.
+
+        Raise InvalidProblem for an invalid line. Only commands have a direct reply.
+        """
+        if line.fault:
+            raise SourceLost(line.fault)
         data = line.data.strip()
-        refused = None
-        if data:
-            counts["lines"] += 1
+        message = parse(data, self.site)
+        self._files.record(data, line.stamp)
+        if message.command:
+            return "answered", self._run_command(message.command)
+        track = self._settings.track if line.track is None else line.track
+        return self._events.take(message, line.stamp, line.when, line.ticket, track=track), None
+
+    def _refuse(self, line: QueuedLine, error: Exception) -> Record:
+        """Count and report a line that cannot be read, and return the report."""
+        LOG.debug("line %d of %s is refused", line.number, line.source, exc_info=error)
+        # A line with an unknown name belongs to an event: record it, since it changes the answer.
+        if isinstance(error, UnknownName):
+            self._files.record(line.data.strip(), line.stamp)
             track = self._settings.track if line.track is None else line.track
-            try:
-                message = parse(data, self.site)
-                self._record_line(data, line.stamp)
-                if message.command:
-                    refused = self._run_command(message.command)
-                else:
-                    self._events.take(message, line.stamp, line.when, ticket, track=track)
-            except Exception as error:  # an error of one line must not end the stream
-                if not isinstance(error, InvalidProblem):
-                    LOG.exception("line %d of %s failed", line.number, line.source)
-                # A line with an unknown name belongs to an event: record it, since it changes the answer.
-                if isinstance(error, UnknownName):
-                    self._record_line(data, line.stamp)
-                    self._events.refuse(error, line.stamp, line.when, track=track)
-                counts["malformed"] += 1
-                refused = {"error": str(error), "line": line.number, "source": line.source}
-                if ticket is None:
-                    self._emit(refused)
-        if ticket is not None:
-            ticket.handled(refused)
+            self._events.refuse(error, line.stamp, line.when, track=track)
+        self.metrics.counts["malformed"] += 1
+        refused: Record = {"error": sentence(error), "line": line.number, "source": line.source}
+        if isinstance(error, RefusedRepeat):
+            refused |= {**shown_name(error.name), "code": error.code}
+        if line.ticket is None:
+            self._emit(refused)
+        return refused
 
     def _run_command(self, command: str) -> Record:
         """Run the command "flush" or "health", and return the record that answers it."""
@@ -320,21 +381,45 @@ class Stream:
     def _answer_closed(self) -> None:
         """Pass the closed events to the engine, and keep them for checkpoints until their answers are written."""
         closed = list(self._events.closing())
-        for event in closed:
-            self._unwritten[event.name] = event
+        with self._settling:
+            self._unsettled.update((id(event), event) for event in closed)
         for first in range(0, len(closed), BATCH):
             self._engine.settle(closed[first : first + BATCH])
 
     # Answers, from all threads.
 
-    def _answer(self, event: of_events.Event, record: Record, last: bool) -> None:
+    def _answer(self, event: Event, record: Record, last: bool) -> None:
         """Write an answer of an event, and pass it to all receivers; `last` marks the last answer of the event."""
         self._publish(record)
-        self._outbox.put(self._format(record, self.site.frame) or b"", event.name if last else None)
-        if event.reply is not None:
-            event.reply.answer(record, last)
-            if last:
-                event.reply = None  # the event is remembered for long, but the client has its last answer
+        whole = self._replies.answer(event, record, last)
+        self._outbox.put(self._written(record, whole, last=last), event if last else None)
+
+    def _written(self, record: Record, whole: Record, *, last: bool) -> bytes:
+        """Return an answer in the output format, as `to_feed`; if the format fails, return the error as an answer."""
+        try:
+            return to_feed(self._settings.format, record, whole, self.site.frame, last=last)
+        except Exception as error:  # an answer that cannot be written must not end the thread that made it
+            LOG.debug("an answer cannot be written", exc_info=error)
+            self.metrics.add("unwritable")
+            return to_line({"event": record["event"], "error": sentence(error)})
+
+    def _settle(self, events: Sequence[Event]) -> None:
+        """Count the lines of events whose last answer was written as answered (the thread of the output)."""
+        with self._settling:
+            for event in events:
+                self._unsettled.pop(id(event), None)
+            self.metrics.account.settle("answered", total(event.lines for event in events))
+            for event in events:
+                event.lines = _NO_LINES
+
+    def _check_account(self) -> None:
+        """Compare the open lines of the account with the lines in queues and events; a difference is an alarm."""
+        with self._settling:
+            held = total(event.lines for event in (*self._unsettled.values(), *self._events.open.values()))
+            found = self.inbox.difference(held)
+        if found and self._imbalance is None:
+            source, count = next(iter(found.items()))
+            self._imbalance = Alarm(f"{count} open lines of {source} are in no queue and no event", self.clock())
 
     def _emit(self, record: Record) -> None:
         """Write a record that is not an answer: a note, an error, health."""
@@ -345,10 +430,14 @@ class Stream:
             self._say(json.dumps(record))
 
     def _publish(self, record: Record) -> None:
-        """Pass a record to the latest fixes and to the listeners."""
-        self.latest(record)
-        for listener in self.listeners:
-            listener(record)
+        """Pass a record to the latest fixes and to the listeners; an error of a receiver must not end the thread."""
+        receivers: tuple[Callable[[Record], None], ...] = (self.latest, *self.listeners)
+        for receive in receivers:
+            try:
+                receive(record)
+            except Exception as error:  # as above
+                LOG.debug("a receiver of answers failed", exc_info=error)
+                self.metrics.add("unwritable")
 
     # Files.
 
@@ -360,8 +449,8 @@ class Stream:
             with access(anew=True):
                 site = read_site(self._again, self.site.method, self.site.options)
             warm_up(site, self._settings.phases)
-        except InvalidProblem as error:
-            self._say(f"The site is not changed: {error}")
+        except Exception as error:  # noqa: BLE001  # an error of the new file must not end the stream
+            self._say(f"The site is not changed: {sentence(error)}")
             return
         self._events.flush(self.clock())
         self._answer_closed()
@@ -371,96 +460,7 @@ class Stream:
         self._events.closed = dict.fromkeys(self._events.closed)  # their rows belong to the old site
         self._say(f"The site is now {site.title!r}, with {len(site.rows)} rows of {len(site.stations)} stations.")
 
-    def _checkpoint(self) -> None:
-        """Write a checkpoint, if set; events whose last answers are written count as closed."""
-        for _ in range(len(self._outbox.written)):
-            self._unwritten.pop(self._outbox.written.popleft(), None)
-        if self._settings.state is not None:
-            try:
-                write_text(self._settings.state, to_line(state_of(self._events, self._unwritten)).decode())
-            except InvalidProblem as error:
-                self._say(f"No checkpoint is written: {error}")  # a full disk must not end the stream
-
-    def _record_line(self, data: bytes, stamp: float) -> None:
-        """Record a line with its time of reading, `stamp`, s, as the first key of its JSON object."""
-        if self._record is not None:
-            self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
-            if len(self._recorded) > _RECORD_BUFFER:
-                self._write_record()
-
-    def _write_record(self, *, last: bool = False) -> None:
-        """Append the collected lines to the recording, if any; with `last`, finish the file."""
-        if self._record is None:
-            return
-        if self._recorded:
-            self._record.append(bytes(self._recorded))
-            self._recorded.clear()
-        if last:
-            self._record.finish()
-
-
-def warm_up(site: Site, phases: str) -> None:
-    """Solve simulated events, so that machine code is loaded before the first real event.
-
-    `phases` are the phases of the answers: "two", "one" or "fix".
-    """
-    ready = site.ready((), site.rows)
-    assert ready is not None  # a site has rows
-    problem = ready.fast.problem
-    x = np.zeros(problem.layout.size)
-    slot, _ = problem.layout.find("position")
-    # away from the centre, where the geometry may be symmetric
-    x[slot.start : slot.start + slot.size] = site.position.mean(0) + 0.1 * np.ptp(site.position, axis=0)
-    with np.errstate(all="ignore"):
-        z = simulate(problem, x, 0, BATCH).z
-    for count in (1, BATCH):
-        ready.fast(z[:count])
-        if phases != "fix":
-            ready.full(z[:count])
-
-
-# Sources that are files: standard input, and recordings.
-
-
-def read_lines(
-    read: Callable[[int], bytes],
-    stream: Stream,
-    source: str,
-    adapter: Callable[[bytes], bytes] | None = None,
-    pending: Callable[[], bool] = bool,
-) -> None:
-    """Read lines until the end and pass them to a stream; while the queue is full, nothing is read.
-
-    Parameters
-    ----------
-    read : callable
-        Returns at most the given number of bytes, as soon as any are available; empty at the end.
-    stream : Stream
-        Receives the lines.
-    source : str
-        Name of the source for messages.
-    adapter : callable, optional
-        Converts input lines to lines of a stream.
-    pending : callable
-        Returns whether input is available: then the time between two reads hardly counts for waiting events.
-    """
-    rest, number, last = b"", 0, stream.clock()
-    stream.pending = pending
-    while True:
-        waited = pending()  # then the input waits for this thread, not this thread for the input
-        if not (piece := read(LINE)):
-            break
-        now = stream.clock()
-        stream.held += _UNCOUNTED * (now - last) if waited else 0.0
-        last = now
-        *whole, rest = (rest + piece).split(b"\n")
-        if len(rest) > 2 * LINE:
-            rest = rest[: LINE + 1]  # the beginning suffices to reject a line that is too long
-        lines = whole if adapter is None else [adapter(data) for data in whole]
-        stream.inbox.put(stream.lines(lines, source, number + 1))
-        number += len(whole)
-        if stream.inbox.closed:
-            return
-    stream.pending = bool
-    if rest:
-        stream.inbox.put(stream.lines([rest if adapter is None else adapter(rest)], source, number + 1))
+    def _state(self, *, ended: bool = False) -> Record:
+        """Return the state for a checkpoint; events whose last answers are written count as closed."""
+        with self._settling:
+            return state_of(self._events, list(self._unsettled.values()), ended=ended)

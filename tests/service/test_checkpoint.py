@@ -10,13 +10,15 @@ from typer.testing import CliRunner
 
 from optloc import InvalidProblem
 from optloc.cli import app
+from optloc.service.account import STATES
 from optloc.service.checkpoint import restore, state_of
-from optloc.service.events import Events, parse
+from optloc.service.events import Events
+from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.stream import Settings, Stream
 
 VALUES = (None, True, 0, -1, 1.5, 1e308, "", "A", "tdoa", "1", "9" * 30, "\ud800", "\x1b[2J", "x" * 300, [], [[]], {})
-VALUES = (*VALUES, {"a": 1}, float("nan"), float("inf"), 10**40, [None] * 5, "optloc live 2")
+VALUES = (*VALUES, {"a": 1}, float("nan"), float("inf"), 10**40, [None] * 5, "optloc live 3")
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +29,24 @@ def site(tmp_path_factory):
 @pytest.fixture(scope="module")
 def good(site):
     """Return the state of a stream with open events of every sort."""
-    events = Events(site, Metrics(), lambda record: None, 10.0)
+    metrics = Metrics()
+    events = Events(site, metrics, lambda record: None, 10.0)
+
+    def take(sent, **more):
+        event = events.take(parse(sent, site), 1.0, 1.0, **more)
+        event.lines["pipe"] = event.lines.get("pipe", 0) + 1
+        metrics.account.receive("pipe")
+
+    metrics.account.receive("request", 2)
+    metrics.account.settle("answered", {"request": 2})
     for i, times in enumerate(arrivals(site, 3)):
         for k, time in enumerate(times[: 3 + i]):
             more = {"target": "T"} if i else {}
-            events.take(parse(line(event=f"e{i}", station="ABCDEF"[k], time_ps=time, **more), site), 1.0, 1.0)
+            take(line(event=f"e{i}", station="ABCDEF"[k], time_ps=time, **more))
     more = {"kind": "tdoa", "z": 2.5, "sigma": 2.0, "time": 3.5}
-    events.take(parse(line(event="r", a="C", b="B", **more), site), 1.0, 1.0, track=True)
+    take(line(event="r", a="C", b="B", **more), track=True)
     events.remember("done", None)
-    return state_of(events, {})
+    return state_of(events)
 
 
 def places(node, path=()):
@@ -94,7 +105,7 @@ def test_every_damage_is_a_sentence_or_does_not_matter(site, good, tmp_path):
             seen["refused"] += 1
         else:
             # what was taken over is a state of its own
-            path.write_text(json.dumps(state_of(events, {})))
+            path.write_text(json.dumps(state_of(events)))
             again = Events(site, Metrics(), lambda record: None, 10.0)
             restore(path, again, 1.0)
             assert again.open.keys() == events.open.keys(), seed
@@ -107,7 +118,26 @@ def test_a_whole_checkpoint_comes_back(site, good, tmp_path):
     path.write_text(json.dumps(good))
     events = Events(site, Metrics(), lambda record: None, 10.0)
     restore(path, events, 1.0)
-    assert state_of(events, {}) == good
+    again = state_of(events)
+    # its stream did not end by itself: what is answered again has a higher revision
+    assert [each.pop("revision") for each in again["open"]] == [2] * len(good["open"])
+    assert again.pop("revision") == 2
+    first = copy.deepcopy(good)
+    assert {each.pop("revision") for each in first["open"]} == {first.pop("revision")} == {1}
+    assert again == first
+
+
+def test_a_checkpoint_of_the_first_format_comes_back(site, good, tmp_path):
+    path, old = tmp_path / "s.state", copy.deepcopy(good)
+    for key in ("ended", "revision", "account"):
+        del old[key]
+    for each in old["open"]:
+        del each["lines"]
+    path.write_text(json.dumps(old | {"format": "optloc live 1"}))
+    events = Events(site, Metrics(), lambda record: None, 10.0)
+    restore(path, events, 1.0)
+    assert [event.name for event in events.open.values()] == [each["event"] for each in good["open"]]
+    assert events.metrics.account.records() == {}
 
 
 @pytest.mark.parametrize(
@@ -118,6 +148,11 @@ def test_a_whole_checkpoint_comes_back(site, good, tmp_path):
         ("closed", ["a", 1], r"damaged \(closed"),
         ("open", {"a": 1}, r"damaged \(open"),
         ("format", "optloc live 9", "not a checkpoint of a stream"),
+        ("account", {"pipe": {"received": 1}}, r"damaged \(account: the counts of a source are incomplete"),
+        ("account", {"pipe": dict.fromkeys(STATES, 1)}, r"damaged \(account: the counts of a source do not balance"),
+        ("account", {}, r"damaged \(account: the open lines"),
+        ("ended", 1, r"damaged \(ended"),
+        ("revision", -1, r"damaged \(revision"),
     ],
 )
 def test_what_is_wrong_is_named(site, good, tmp_path, key, value, said):
@@ -148,6 +183,23 @@ def test_the_command_ends_with_one_sentence_and_leaves_no_recording(tmp_path):
     assert done.exit_code == 2
     assert "this checkpoint is damaged" in " ".join(done.output.split())
     assert {path.name for path in tmp_path.iterdir()} == {"site.toml", "s.state"}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\x89PNG\r\n\x1a\n" + bytes(64), b"[1]", b'{"format": "optloc live 2"', b'{"format": "optloc live 2"}'],
+)
+def test_a_file_that_is_no_checkpoint_is_named_with_the_next_step(site, tmp_path, data):
+    path = tmp_path / "s.state"
+    path.write_bytes(data)
+    with pytest.raises(InvalidProblem) as found:
+        Stream(site, Settings(state=path, phases="fix"), Answers())
+    said = str(found.value)
+    assert "s.state" in said
+    assert "\n" not in said
+    assert "remove it" in said or "another file" in said
+    assert path.read_bytes() == data
+    assert not (tmp_path / "s.state.lock").exists()
 
 
 def test_a_time_that_is_beyond_all_clocks_is_refused_before_it_is_kept(site):

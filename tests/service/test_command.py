@@ -20,7 +20,7 @@ from optloc.service.command import (
     seconds_of,
     wait,
 )
-from optloc.service.events import parse
+from optloc.service.messages import parse
 from optloc.service.site import FAST
 
 
@@ -65,10 +65,13 @@ def test_a_stream_ends_with_the_code_of_what_ended_it():
     ended, not_set, pressed = Flag(), Flag(), Flag()
     ended.set()
     pressed.set()
-    good = SimpleNamespace(ended=ended, error=None, failed=False)
-    gone = SimpleNamespace(ended=ended, error=None, failed=True)
+    sources, broken = SimpleNamespace(failed=[]), SimpleNamespace(failed=["mqtt"])
+    good = SimpleNamespace(ended=ended, error=None, failed=False, sources=sources)
+    gone = SimpleNamespace(ended=ended, error=None, failed=True, sources=sources)
+    lost = SimpleNamespace(ended=ended, error=None, failed=False, sources=broken)
     assert wait(good, not_set) == 0
-    assert len({wait(good, not_set), wait(good, pressed), wait(gone, not_set)}) == 3
+    assert wait(lost, not_set) == 3
+    assert len({wait(each, not_set) for each in (good, gone, lost)} | {wait(lost, pressed)}) == 4
     with pytest.raises(InvalidProblem, match="the site"):
         wait(SimpleNamespace(ended=ended, error=InvalidProblem("the site is gone", None, ""), failed=False), not_set)
 

@@ -5,11 +5,14 @@ import json
 import pytest
 from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
 
-from optloc.service.events import Events, parse
+from optloc.service.adapters import ChirpStack
+from optloc.service.checkpoint import restore, state_of
+from optloc.service.events import Events
+from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.site import FAST, UnknownName
-from optloc.service.sources import ChirpStack
-from optloc.service.stream import Settings, Stream, read_lines, restore, state_of
+from optloc.service.sources import read_lines
+from optloc.service.stream import Settings, Stream
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +99,7 @@ def test_a_checkpoint_keeps_what_refused_an_event(site, tmp_path):
         parse(line(event="k", station="AA", time_ns=5), site)
     events.refuse(raised.value, 0.0, 0.0)
     path = tmp_path / "state"
-    path.write_text(json.dumps(state_of(events, {})))
+    path.write_text(json.dumps(state_of(events)))
     again = Events(site, Metrics(), lambda note: None)
     restore(path, again, 0.0)
     assert "there is no station 'AA'" in again.open["k"].refused

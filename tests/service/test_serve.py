@@ -1,12 +1,12 @@
 """A stream over HTTP: requests, limits, strangers' pages, the websocket, the map."""
 
-import http.client
 import json
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from service.lines import SITE, Answers, arrivals, differences, line, site_in, solved
+from service.conftest import ON_EARTH
+from service.lines import Answers, arrivals, ask, differences, line, solved
 from show.browser import Browser, executable, readable
 
 pytest.importorskip("starlette")
@@ -17,39 +17,21 @@ ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 from optloc.base.errors import InvalidProblem  # noqa: E402  (after the libraries that may be missing)
 from optloc.cli.track import runs_of  # noqa: E402
 from optloc.files import read  # noqa: E402
+from optloc.service.http_options import AccessRules, digest_of  # noqa: E402
 from optloc.service.serve import serve  # noqa: E402
 from optloc.service.stream import Settings, Stream  # noqa: E402
 from optloc.service.tracks import Following  # noqa: E402
 from optloc.tracking import polynomial, tracked  # noqa: E402
 
-ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
+
+@pytest.fixture(scope="module")
+def site(on_earth):
+    return on_earth
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    return site_in(tmp_path_factory.mktemp("site"), ON_EARTH)
-
-
-@pytest.fixture(scope="module")
-def served(site):
-    """Return a stream that listens, and its port."""
-    stream = Stream(site, Settings(wait=0.05), Answers())
-    port, stop = serve(stream, port=0)
-    yield stream, port
-    stream.close()
-    assert stream.ended.wait(10.0)
-    stop()
-
-
-def ask(port, method, path, body=None, **headers):
-    """Return code, headers and text of an answer; names of headers have underscores here."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
-    given = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, given)
-    answer = connection.getresponse()
-    found = answer.status, dict(answer.getheaders()), answer.read().decode()
-    connection.close()
-    return found
+def served(server):
+    return server
 
 
 def test_a_request_is_answered_with_its_fix_and_proof(site, served):
@@ -74,8 +56,7 @@ def test_rows_of_one_event_may_come_in_several_requests(site, served):
     parts = [line(event="parts", station=name, time_ps=t) for name, t in zip("ABCDEF", times, strict=True)]
     code, _, said = ask(port, "POST", "/fix", b"\n".join(parts))
     assert (code, json.loads(said)["dof"]) == (200, 2)
-    code, _, said = ask(port, "POST", "/fix", parts[0])
-    assert (code, json.loads(said)) == (200, {"accepted": 1})
+    assert ask(port, "POST", "/fix", parts[0])[::2] == (200, said)
 
 
 def test_bad_requests_are_refused_in_a_sentence(served):
@@ -245,7 +226,7 @@ def test_a_websocket_takes_lines_and_tells_all_answers(site, served):
 
 def test_a_websocket_that_reads_too_slowly_is_closed(served, monkeypatch):
     stream, port = served
-    monkeypatch.setattr("optloc.service.serve._QUEUE", 4)
+    monkeypatch.setattr("optloc.service.sockets._QUEUE", 4)
     with connect(f"ws://127.0.0.1:{port}/ws", open_timeout=10.0) as socket:
         socket.send("{}")
         socket.recv(timeout=10.0)
@@ -259,3 +240,23 @@ def test_a_place_that_is_taken_is_said(served):
     stream, port = served
     with pytest.raises(InvalidProblem, match=f"the address 127.0.0.1:{port} is not available"):
         serve(stream, port=port)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "fixes.example.org"])
+def test_other_machines_need_a_token(served, host):
+    with pytest.raises(InvalidProblem, match=f"other machines reach {host}, and requests need no token") as caught:
+        serve(served[0], host, 0)
+    assert "--token-file FILE, or --no-token" in str(caught.value)
+
+
+@pytest.mark.parametrize("access", [AccessRules(tokens=(digest_of("x" * 16),)), AccessRules(open=True)])
+def test_a_server_for_others_answers_under_its_address(site, access):
+    stream = Stream(site, Settings(), Answers())
+    port, stop = serve(stream, "0.0.0.0", 0, access)
+    given = {"Host": "192.168.1.5", "Authorization": f"Bearer {'x' * 16}"}
+    assert ask(port, "GET", "/health", **given)[0] == 200
+    assert ask(port, "GET", "/health", **given | {"Host": "evil.example"})[0] == 400
+    assert ask(port, "GET", "/health", Host="192.168.1.5")[0] == (401 if access.tokens else 200)
+    stream.close()
+    assert stream.ended.wait(10.0)
+    stop()

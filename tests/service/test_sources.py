@@ -1,19 +1,22 @@
-"""Brokers and the formats of others: MQTT from a broker of 40 lines, ZeroMQ, ChirpStack, Mode S."""
+"""Sources: MQTT and ZeroMQ with restarts of the broker, and standard input that fails."""
 
-import json
 import socket
-import threading
+import subprocess
 import time
+from contextlib import suppress
+from shutil import which
 
 import pytest
-from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
+from service.broker import Broker, wait_for
+from service.lines import Answers, line, site_in
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.service.queues import Inbox
+from optloc.service.adapters import adapter_of
+from optloc.service.queues import Inbox, QueuedLine
 from optloc.service.site import FAST
-from optloc.service.sources import ChirpStack, ModeS, adapter_of, mqtt, zeromq
+from optloc.service.sources import mqtt, standard_input, zeromq
 from optloc.service.stream import Settings, Stream
 
 
@@ -32,55 +35,33 @@ def stream(site):
     assert made.ended.wait(10.0)
 
 
-def wait_for(true):
-    until = time.monotonic() + 20.0
-    while not true() and time.monotonic() < until:
-        time.sleep(0.01)
-    assert true()
+def running(stream, source):
+    """Run a source of a stream, and return its state."""
+    stream.start(source)
+    return stream.sources._running[-1][1]
 
 
-# MQTT 3.1.1 (OASIS, 2014): the packets that a subscriber needs.
+# MQTT.
 
 
-def broker(messages, seen):
-    """Return the port of a broker for one client: it accepts, and sends messages once that has subscribed."""
-    listener = socket.create_server(("127.0.0.1", 0))
-
-    def run():
-        connection, _ = listener.accept()
-        with connection, listener:
-            while head := connection.recv(1):
-                body = connection.recv(connection.recv(1)[0])  # no packet here is as long as 128 bytes
-                if head[0] >> 4 == 1:
-                    connection.sendall(b"\x20\x02\x00\x00")
-                elif head[0] >> 4 == 8:
-                    seen.append(body[4 : 4 + body[3]])
-                    connection.sendall(b"\x90\x03" + body[:2] + b"\x00")
-                    for payload in messages:
-                        packet = b"\x00\x01t" + payload
-                        size = (
-                            bytes([len(packet) % 128 | 128, len(packet) // 128])
-                            if len(packet) > 127
-                            else bytes([len(packet)])
-                        )
-                        connection.sendall(b"\x30" + size + packet)
-                elif head[0] >> 4 == 14:
-                    return
-
-    threading.Thread(target=run, daemon=True).start()
-    return listener.getsockname()[1]
-
-
-def test_messages_of_a_broker_are_lines(stream):
+@pytest.fixture
+def broker():
     pytest.importorskip("paho.mqtt.client")
-    seen = []
+    made = Broker()
+    yield made
+    made.stop()
+
+
+def test_messages_of_a_broker_are_lines(stream, broker):
     good = [line(event=str(i), z=[10.0 * i] * 5) for i in range(3)]
-    port = broker([good[0], good[1] + b"\n" + good[2] + b"\n", b"nonsense"], seen)
-    stop = mqtt(stream, f"mqtt://127.0.0.1:{port}/site/+/toa/%23")
+    stream.start(mqtt(stream, f"mqtt://127.0.0.1:{broker.port}/site/+/toa/%23"))
+    wait_for(lambda: broker.subscribers == 1)
+    for payload in (good[0], good[1] + b"\n" + good[2] + b"\n", b"nonsense"):
+        broker.publish(payload)
     wait_for(lambda: len(stream.out.records) == 4)
-    stop()
+    stream.sources.stop()
     records = stream.out.records
-    assert seen == [b"site/+/toa/#"]
+    assert broker.topics == [b"site/+/toa/#"]
     assert {record["event"] for record in records if "event" in record} == {"0", "1", "2"}
     assert [record["line"] for record in records if "error" in record] == [4]
 
@@ -100,10 +81,97 @@ def test_a_broker_that_is_not_there_is_said(stream):
         mqtt(stream, f"mqtt://127.0.0.1:{port}/topic")
 
 
+def check_restart(stream, watch, publish, stop, start):
+    """Publish, stop and start a broker: the loss is an alarm, and messages arrive again after the restart."""
+    publish(line(event="before", z=[1.0] * 5))
+    wait_for(lambda: "before" in {record.get("event") for record in stream.out.records})
+    assert stream.health()["alarms"] == []
+    stop()
+    wait_for(lambda: stream.health()["alarms"])
+    (alarm,) = stream.health()["alarms"]
+    assert (alarm["part"], alarm["name"]) == ("source", watch.name)
+    assert "lost" in alarm["error"]
+    assert f'optloc_alarm{{part="source",name="{watch.name}"}} 1' in stream.metrics.text(0.0)
+    assert stream.sources.failed == [watch.name]
+    start()
+    wait_for(lambda: not stream.health()["alarms"])
+    publish(line(event="after", z=[2.0] * 5))
+    wait_for(lambda: "after" in {record.get("event") for record in stream.out.records})
+    said = [record for record in stream.out.records if record.get("source") == watch.name]
+    assert [set(record) for record in said] == [{"source", "error"}, {"source", "note"}]
+    assert stream.sources.failed == []
+    counts = stream.health()["account"][watch.name]
+    assert counts == {"received": 2, "answered": 2, "refused": 0, "dropped": 0, "open": 0}
+
+
+def test_a_broker_that_restarts_is_an_alarm_until_it_is_back(stream, broker):
+    watch = running(stream, mqtt(stream, f"mqtt://127.0.0.1:{broker.port}/t"))
+    wait_for(lambda: broker.subscribers == 1)
+
+    def start():
+        broker.start()
+        wait_for(lambda: broker.subscribers == 1)
+
+    check_restart(stream, watch, broker.publish, broker.stop, start)
+    assert watch.restarts >= 1
+
+
+def test_a_broker_that_refuses_is_an_alarm(stream, broker):
+    broker.refuses = True
+    watch = running(stream, mqtt(stream, f"mqtt://127.0.0.1:{broker.port}/t"))
+    wait_for(lambda: watch.alarm is not None)
+    assert "the broker refuses (" in watch.alarm.error
+    broker.refuses = False
+    wait_for(lambda: watch.alarm is None)
+
+
+@pytest.mark.skipif(which("mosquitto") is None, reason="mosquitto is not installed")
+def test_mosquitto_restarts(stream):
+    paho = pytest.importorskip("paho.mqtt.client")
+    enums = pytest.importorskip("paho.mqtt.enums")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    process = []
+
+    def start():
+        process.append(subprocess.Popen(["mosquitto", "-p", str(port)], stderr=subprocess.DEVNULL))
+        wait_for(lambda: _answers(port))
+
+    def stop():
+        process[-1].terminate()
+        process[-1].wait(10.0)
+
+    def publish(payload):
+        client = paho.Client(enums.CallbackAPIVersion.VERSION2)
+        client.connect("127.0.0.1", port)
+        client.loop_start()
+        client.publish("t", payload, qos=1).wait_for_publish(10.0)
+        client.loop_stop()
+
+    start()
+    try:
+        watch = running(stream, mqtt(stream, f"mqtt://127.0.0.1:{port}/t"))
+        time.sleep(1.0)  # until the subscription
+        check_restart(stream, watch, publish, stop, start)
+    finally:
+        stop()
+
+
+def _answers(port):
+    """Return whether a server accepts connections at a port."""
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+        return True
+    return False
+
+
+# ZeroMQ.
+
+
 def test_what_a_broker_sends_too_much_of_loses_its_oldest():
     inbox = Inbox(most=4)
-    dropped = [inbox.push(number) for number in range(7)]
-    assert (dropped, inbox.take(9, 0.0)) == ([0, 0, 0, 0, 1, 1, 1], [3, 4, 5, 6])
+    lines = [QueuedLine(b"", number, "test", 0.0, 0.0) for number in range(7)]
+    dropped = [inbox.push(each) for each in lines]
+    assert (dropped, inbox.take(9, 0.0)) == ([0, 0, 0, 0, 1, 1, 1], lines[3:])
 
 
 @pytest.mark.parametrize("pulls", [True, False], ids=["push", "publish"])
@@ -115,61 +183,59 @@ def test_messages_of_zeromq_are_lines(stream, pulls):
     if pulls:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             place = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        stop = zeromq(stream, f"pull+{place}")
+        stream.start(zeromq(stream, f"pull+{place}"))
         other.connect(place)
     else:
         place = f"tcp://127.0.0.1:{other.bind_to_random_port('tcp://127.0.0.1')}"
-        stop = zeromq(stream, place)
+        stream.start(zeromq(stream, place))
         time.sleep(0.5)  # who subscribes late has missed what was said
     for i in range(3):
         other.send(line(event=str(i), z=[10.0 * i] * 5))
     wait_for(lambda: len(stream.out.records) == 3)
-    stop()
+    stream.sources.stop()
     context.destroy(0)
     with pytest.raises(InvalidProblem, match="cannot be used"):
         zeromq(stream, "nonsense")
 
 
-def test_uplinks_of_chirpstack_are_events(site):
-    times = arrivals(site, 1)[0]
-    heard = [
-        {"gatewayId": name, "rssi": -80, "fineTimeSinceGpsEpoch": f"{t // 10**12}.{t % 10**12 // 1000:09d}s"}
-        for name, t in zip("ABCDEF", times, strict=True)
-    ]
-    heard += [{"gatewayId": "roaming", "fineTimeSinceGpsEpoch": "1.5s"}, {"gatewayId": "A2"}]
-    uplink = {
-        "deduplicationId": "3ac7e3c4",
-        "deviceInfo": {"devEui": "0101010101010101", "tenantName": "x"},
-        "fCnt": 12,
-        "rxInfo": heard,
-    }
-    adapter = ChirpStack(site.stations)
-    records, _ = answers(site, [adapter(json.dumps(uplink).encode())], phases="fix")
-    (record,) = records
-    assert (record["event"], record["target"], record["dof"]) == ("3ac7e3c4", "0101010101010101", 2)
-    uplink["rxInfo"] = heard[-1:]
-    (record,) = answers(site, [adapter(json.dumps(uplink).encode())], phases="fix")[0]
-    assert "arrivals: the value is not a list of 1 to 4096 entries" in record["error"]
-    assert adapter(b"nonsense") == b"nonsense"
+def test_a_publisher_that_restarts_is_an_alarm_until_it_is_back(stream):
+    zmq = pytest.importorskip("zmq")
+    context, sockets, place = zmq.Context(), [], ["tcp://127.0.0.1:*"]
+
+    def start():
+        sockets.append(context.socket(zmq.PUB))
+        sockets[-1].setsockopt(zmq.LINGER, 0)
+        sockets[-1].bind(place[0])
+        place[0] = sockets[-1].getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def publish(payload):
+        time.sleep(0.5)  # until the subscription
+        sockets[-1].send(payload)
+
+    start()
+    watch = running(stream, zeromq(stream, place[0]))
+    check_restart(stream, watch, publish, sockets[-1].close, start)
+    context.destroy(0)
 
 
-def test_mode_s_messages_are_arrivals(site):
-    adapter, bits = ModeS(site.stations), "8d4840d6202cc371c32ce0576098"
-    nanoseconds = [t // 1000 - EPOCH // 1000 for t in arrivals(site, 1)[0]]
+# Standard input.
 
-    def sent(start):
-        return [
-            adapter(json.dumps({"receiver": name, "mlat": {"t": (start + t) % (86_400 * 10**9), "m": bits}}).encode())
-            for name, t in zip("FEDCBA", reversed(nanoseconds), strict=True)
-        ]
 
-    # once over midnight, and the same bits again
-    lines = [*sent(86_400 * 10**9 - 9000), *sent(5 * 10**8)]
-    records, health = answers(site, lines, phases="fix", wait=10.0)
-    assert [(r["event"], r["target"], r["dof"]) for r in records] == [(f"{bits}-{i}", "4840d6", 2) for i in (0, 1)]
-    assert records[0]["position"] == pytest.approx(records[1]["position"], abs=1e-3)
-    assert health["malformed"] == 0
-    assert adapter(b'{"sync": {}}') == b'{"sync": {}}'
+def test_standard_input_that_fails_for_good_is_no_end_without_an_error(stream, monkeypatch):
+    monkeypatch.setattr("optloc.service.supervisor.FIRST_DELAY", 0.01)
+    pieces = [line(event="1", z=[1.0] * 5) + b"\n", OSError(5, "Input/output error"), b"2\n"]
+
+    def read(_):
+        piece = pieces.pop(0) if pieces else OSError(5, "Input/output error")
+        if isinstance(piece, OSError):
+            raise piece
+        return piece
+
+    watch = running(stream, standard_input(stream, read))
+    assert stream.ended.wait(20.0)
+    assert watch.alarm.error == "OSError: [Errno 5] Input/output error"
+    assert stream.sources.failed == ["stdin"]
+    assert stream.health()["account"]["stdin"]["received"] == 2
 
 
 def test_unknown_formats_and_addresses_are_one_sentence(tmp_path):

@@ -1,0 +1,134 @@
+"""Supervision of the sources of a stream: each source runs in a thread, and starts again after an error.
+
+A source that fails is one line with its name, an alarm in health and metrics, and a part of the exit code until it
+works again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from threading import Event, Thread
+from typing import Any
+
+from optloc.service.alarms import FIRST_DELAY, LONGEST_DELAY, Alarm, sentence
+
+LOG = logging.getLogger("optloc.service")
+
+# Seconds for which the end of the stream waits for a source.
+_PATIENCE = 5.0
+
+
+class Watch:
+    """State of a running source, for the source and for its supervisor.
+
+    name: name of the source. stopping: set when the source must end. alarm: its error, or None while it works.
+    restarts: number of restarts since the start.
+    """
+
+    def __init__(self, name: str, clock: Callable[[], float], report: Callable[[dict[str, Any]], None]) -> None:
+        self.name, self._clock, self._report = name, clock, report
+        self.stopping, self.restarts, self.delay = Event(), 0, FIRST_DELAY
+        self.alarm: Alarm | None = None
+
+    def works(self) -> None:
+        """Register that the source works: its alarm ends, and its next restart is quick."""
+        if self.alarm is not None:
+            self.alarm = None
+            self._report({"source": self.name, "note": "recovered"})
+        self.delay = FIRST_DELAY
+
+    def fails(self, error: str) -> None:
+        """Register that the source does not work; only the first of several errors in a row is reported."""
+        if self.alarm is None:
+            self.alarm = Alarm(error, self._clock())
+            self._report({"source": self.name, "error": error})
+
+
+@dataclass(frozen=True, slots=True)
+class LineSource:
+    """A source of lines.
+
+    Parameters
+    ----------
+    name : str
+        Name in messages, alarms and the account.
+    run : callable
+        Reads the source until its end, or until `Watch.stopping` is set; it raises an exception if the source fails.
+    is_last : bool
+        Whether the stream ends with this source.
+    tries : float
+        Number of restarts without success after which the source is given up; infinity: never.
+    """
+
+    name: str
+    run: Callable[[Watch], None]
+    is_last: bool = False
+    tries: float = inf
+
+
+class Supervisor:
+    """Threads of all sources of a stream.
+
+    Parameters
+    ----------
+    close : callable
+        Ends the stream.
+    report : callable
+        Receives one record for each failure and each recovery.
+    clock : callable
+        Monotonic clock, s.
+    watched : callable
+        Receives the state of each new source, for health and metrics.
+    """
+
+    def __init__(
+        self,
+        close: Callable[[], None],
+        report: Callable[[dict[str, Any]], None],
+        clock: Callable[[], float],
+        watched: Callable[[Watch], None] = lambda watch: None,
+    ) -> None:
+        self._close, self._report, self._clock, self._watched = close, report, clock, watched
+        self._running: list[tuple[LineSource, Watch, Thread]] = []
+
+    def start(self, source: LineSource) -> None:
+        """Run a source in a separate thread until it ends, is given up, or `stop` is called."""
+        watch = Watch(source.name, self._clock, self._report)
+        self._watched(watch)
+        thread = Thread(target=self._run, args=(source, watch), name=f"optloc {source.name}", daemon=True)
+        self._running.append((source, watch, thread))
+        thread.start()
+
+    def stop(self) -> None:
+        """End all sources, and wait some seconds for each."""
+        for _, watch, _ in self._running:
+            watch.stopping.set()
+        for source, _, thread in self._running:
+            if not source.is_last:  # a read of standard input cannot be interrupted
+                thread.join(_PATIENCE)
+
+    @property
+    def failed(self) -> list[str]:
+        """Return the names of the sources that do not work."""
+        return [watch.name for _, watch, _ in self._running if watch.alarm is not None]
+
+    def _run(self, source: LineSource, watch: Watch) -> None:
+        """Run a source, and again after each error with a growing delay (the thread of the source)."""
+        tries = 0
+        while not watch.stopping.is_set():
+            try:
+                source.run(watch)
+                break
+            except Exception as error:  # any error of a source is an alarm, and no error may end its thread
+                LOG.debug("source %s failed", source.name, exc_info=error)
+                tries = tries + 1 if watch.alarm is not None else 1
+                watch.fails(sentence(error))
+            if tries > source.tries or watch.stopping.wait(watch.delay):
+                break
+            watch.delay = min(2.0 * watch.delay, LONGEST_DELAY)
+            watch.restarts += 1
+        if source.is_last:
+            self._close()
