@@ -10,6 +10,7 @@ from typing import Any
 from optloc.problem import InvalidProblem, nearest
 from optloc.service.alarms import sentence
 from optloc.service.messages import LINE
+from optloc.service.strict_json import read_object
 
 LOG = logging.getLogger("optloc.service")
 
@@ -112,13 +113,10 @@ def _address(bits: str) -> str:
 
 def _object(line: bytes) -> dict[str, Any] | None:
     """Return the JSON object of a line; None if it is too long or is not an object."""
-    if len(line) > 4 * LINE:  # an uplink has many parts that are not used
-        return None
     try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):
+        return read_object(line, 4 * LINE)  # an uplink has many parts that are not used
+    except InvalidProblem:
         return None
-    return found if isinstance(found, dict) else None
 
 
 ADAPTERS: Mapping[str, Callable[[Collection[str]], Adapter]] = {"chirpstack": ChirpStack, "mode-s": ModeS}

@@ -38,6 +38,7 @@ from optloc.cli import (
 )
 from optloc.files import claim, visible
 from optloc.problem import InvalidProblem, nearest
+from optloc.service.http_options import AccessRules, Hosts, Http, NoToken, Tokens, access_of, address_of
 
 if TYPE_CHECKING:
     from optloc.service.adapters import Adapter
@@ -84,12 +85,6 @@ State = Annotated[
 Every = Annotated[str, typer.Option("--every", metavar="TIME", help="Time between checkpoints.")]
 Record = Annotated[Path | None, typer.Option("--record", metavar="FILE", help="Record the input lines.")]
 
-Http = Annotated[
-    str | None,
-    typer.Option(
-        "--http", metavar="[HOST:]PORT", help="Accept HTTP requests as well; by default from this machine only."
-    ),
-]
 Mqtt = Annotated[
     str | None, typer.Option("--mqtt", metavar="URL", help="Read a topic of an MQTT broker: mqtt://host:1883/topic.")
 ]
@@ -143,6 +138,9 @@ def live(
     every: Every = "5 s",
     record: Record = None,
     http: Http = None,
+    hosts: Hosts = None,
+    token_file: Tokens = None,
+    no_token: NoToken = False,
     mqtt: Mqtt = None,
     zmq: Zmq = None,
     adapter: Adapt = None,
@@ -176,6 +174,7 @@ def live(
     options = ServiceOptions(
         settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq),
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
+        access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -183,7 +182,7 @@ def live(
 SERVED = example(
     "optloc serve site.toml",
     'curl -d \'{"event": "1", "z": [283.0, 1739.5, 1102.9, 524.3, 2344.4]}\' localhost:8200/fix',
-    "optloc serve site.toml --http 0.0.0.0:8200 --mqtt mqtt://broker/toa/#",
+    "optloc serve site.toml --http 0.0.0.0:8200 --token-file tokens.txt --mqtt mqtt://broker/toa/#",
 )
 
 
@@ -192,6 +191,9 @@ def serve(
     http: Annotated[
         str, typer.Option("--http", metavar="[HOST:]PORT", help="Address of the server; by default this machine only.")
     ] = "8200",
+    hosts: Hosts = None,
+    token_file: Tokens = None,
+    no_token: NoToken = False,
     method: Method = "auto",
     wait: Wait = "50 ms",
     late: Late = "drop",
@@ -229,6 +231,7 @@ def serve(
     options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
+        access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
     raise typer.Exit(run_live(file, options))
 
@@ -277,6 +280,7 @@ class ServiceOptions:
     proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
     not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
     recording. stdout: whether answers go to standard output. stated: options on the wave and the height, or None.
+    access: rules of access to HTTP, or None.
     """
 
     settings: dict[str, Any]
@@ -292,6 +296,7 @@ class ServiceOptions:
     stdin: bool = True
     stdout: bool = True
     stated: SiteOptions | None = None
+    access: AccessRules | None = None
 
 
 def run_live(file: Path, options: ServiceOptions) -> int:
@@ -347,11 +352,8 @@ def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stop
 
     opened = ""
     if options.http is not None:
-        host, _, port = options.http.rpartition(":")
-        if not port.isdecimal():
-            raise InvalidProblem(f"{options.http!r} is not a port", "--http", "write 8200, or 0.0.0.0:8200")
-        host = host.strip("[]") or requests.HOST
-        number, stop = requests.serve(stream, host, int(port))
+        host, port = address_of(options.http)
+        number, stop = requests.serve(stream, host, port, options.access)
         stops.callback(stop)
         opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
     for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):

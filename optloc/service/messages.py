@@ -16,13 +16,16 @@ LINE = 1 << 16
 """Largest size of a line, bytes: more than a thousand rows."""
 
 COMMANDS = ("flush", "health")
-# Largest number of characters of an id or a name, and of rows of an event: far more than any network has.
-_NAME, _ROWS = 256, 4096
-_KEYS = {
+NAME, ROWS = 256, 4096
+"""Largest number of characters of an id or a name, and of rows of an event: far more than any network has."""
+
+KEYS = {
     *("command", "event", "z", "rows", "arrivals", "station", "kind", "a", "b", "sigma", "more", "target", "received"),
     *("time", "time_ns", "time_ps", "client"),
 }
-_ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
+ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
+"""Permitted keys of a line, and of a row in the list ``rows``."""
+
 # Decimals that give picoseconds, by the key of a time.
 _DIGITS = {"time": 12, "time_ns": 3, "time_ps": 0}
 _DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
@@ -90,10 +93,10 @@ def parse(line: bytes, site: Site) -> Message:
 
 def _general(found: dict[str, Any], site: Site) -> Message:
     """Return the content of a line with any permitted keys; errors as in `parse`."""
-    unknown = found.keys() - _KEYS
+    unknown = found.keys() - KEYS
     if unknown:
         name = min(unknown)
-        raise InvalidProblem(f"unknown key {name[:40]!r}", None, nearest(name, sorted(_KEYS)))
+        raise InvalidProblem(f"unknown key {name[:40]!r}", None, nearest(name, sorted(KEYS)))
     if "command" in found:
         command = found["command"]
         if command not in COMMANDS:
@@ -126,6 +129,14 @@ def stamped(data: bytes, received: float) -> bytes:
     return b'{"received":%.6f,' % received + data[1:]
 
 
+def of_client(line: bytes, client: str | None) -> bytes:
+    """Return a line with the name of its client as its first key; a line that is no object is returned unchanged."""
+    data = line.strip()
+    if not client or data[:1] != b"{" or data[1:].lstrip()[:1] != b'"':
+        return line
+    return b'{"client":%s,' % json.dumps(client).encode() + data[1:]
+
+
 # Clients may use the same ids. A line feed joins client and id, because no name may contain one.
 
 
@@ -151,7 +162,7 @@ def _named(
     rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
     if "rows" in forms:
         for entry in _list(found["rows"], "rows"):
-            _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
+            _row(_object(entry, ROW_KEYS, "rows"), site, rows, sigmas)
     if "arrivals" in forms:
         for entry in _list(found["arrivals"], "arrivals"):
             _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
@@ -174,8 +185,8 @@ def _event(found: Mapping[str, Any]) -> str:
 
 def _text(given: Any, key: str) -> str:
     """Return a name under `key`; raise InvalidProblem for other values, such as text with control characters."""
-    if type(given) is not str or not given or len(given) > _NAME or _BREAKS.search(given) or has_controls(given):
-        raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {_NAME} printable characters")
+    if type(given) is not str or not given or len(given) > NAME or _BREAKS.search(given) or has_controls(given):
+        raise InvalidProblem(f"{str(given)[:40]!r} is not a name", key, f"give 1 to {NAME} printable characters")
     return given
 
 
@@ -197,8 +208,8 @@ def _when(found: Mapping[str, Any], forms: list[str]) -> int | None:
 
 def _list(given: Any, key: str) -> list[Any]:
     """Return a list of 1 to 4096 entries under `key`; raise InvalidProblem for other values."""
-    if type(given) is not list or not 0 < len(given) <= _ROWS:
-        raise InvalidProblem(f"the value is not a list of 1 to {_ROWS} entries", key, "give a list")
+    if type(given) is not list or not 0 < len(given) <= ROWS:
+        raise InvalidProblem(f"the value is not a list of 1 to {ROWS} entries", key, "give a list")
     return given
 
 

@@ -61,6 +61,6 @@ class Replies:
         if event.replies:
             self._kept.pop(event.name, None)
             self._kept[event.name] = to_line(join(None, whole))
-            if len(self._kept) > self._most:
+            while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
         event.answered, event.so_far, event.replies = True, None, []

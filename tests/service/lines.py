@@ -1,5 +1,6 @@
 """What the tests of streams share: a site, events drawn on it as lines, and a stream that answers them."""
 
+import http.client
 import json
 import time
 from dataclasses import replace
@@ -131,3 +132,14 @@ def slowed(site, busy=False):
             return other
 
     return Other(*(getattr(site, name) for name in site.__dataclass_fields__))
+
+
+def ask(port, method, path, body=None, **headers):
+    """Return code, headers and text of an answer; names of headers have underscores here."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
+    given = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, body, given)
+    answer = connection.getresponse()
+    found = answer.status, dict(answer.getheaders()), answer.read().decode()
+    connection.close()
+    return found

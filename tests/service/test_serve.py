@@ -1,12 +1,16 @@
 """A stream over HTTP: requests, limits, strangers' pages, the websocket, the map."""
 
-import http.client
 import json
+import time
+import urllib.error
+import urllib.request
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from service.lines import SITE, Answers, arrivals, differences, line, site_in, solved
+from service.broker import wait_for
+from service.conftest import ON_EARTH
+from service.lines import Answers, arrivals, ask, differences, line, solved
 from show.browser import Browser, executable, readable
 
 pytest.importorskip("starlette")
@@ -22,34 +26,15 @@ from optloc.service.stream import Settings, Stream  # noqa: E402
 from optloc.service.tracks import Following  # noqa: E402
 from optloc.tracking import polynomial, tracked  # noqa: E402
 
-ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
+
+@pytest.fixture(scope="module")
+def site(on_earth):
+    return on_earth
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    return site_in(tmp_path_factory.mktemp("site"), ON_EARTH)
-
-
-@pytest.fixture(scope="module")
-def served(site):
-    """Return a stream that listens, and its port."""
-    stream = Stream(site, Settings(wait=0.05), Answers())
-    port, stop = serve(stream, port=0)
-    yield stream, port
-    stream.close()
-    assert stream.ended.wait(10.0)
-    stop()
-
-
-def ask(port, method, path, body=None, **headers):
-    """Return code, headers and text of an answer; names of headers have underscores here."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
-    given = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, given)
-    answer = connection.getresponse()
-    found = answer.status, dict(answer.getheaders()), answer.read().decode()
-    connection.close()
-    return found
+def served(server):
+    return server
 
 
 def test_a_request_is_answered_with_its_fix_and_proof(site, served):
@@ -244,7 +229,7 @@ def test_a_websocket_takes_lines_and_tells_all_answers(site, served):
 
 def test_a_websocket_that_reads_too_slowly_is_closed(served, monkeypatch):
     stream, port = served
-    monkeypatch.setattr("optloc.service.serve._QUEUE", 4)
+    monkeypatch.setattr("optloc.service.sockets._QUEUE", 4)
     with connect(f"ws://127.0.0.1:{port}/ws", open_timeout=10.0) as socket:
         socket.send("{}")
         socket.recv(timeout=10.0)
@@ -258,3 +243,43 @@ def test_a_place_that_is_taken_is_said(served):
     stream, port = served
     with pytest.raises(InvalidProblem, match=f"the address 127.0.0.1:{port} is not available"):
         serve(stream, port=port)
+
+
+def test_a_server_that_ends_by_itself_is_an_alarm_and_starts_again(site):
+    import uvicorn
+
+    class Once(uvicorn.Server):
+        """A server whose first run fails."""
+
+        runs = 0
+
+        def run(self, sockets=None):
+            Once.runs += 1
+            if Once.runs == 1:
+                for each in sockets:
+                    each.close()
+                raise SystemExit(3)  # as uvicorn does if it cannot start
+            super().run(sockets)
+
+    stream = Stream(site, Settings(), Answers())
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("uvicorn.Server", Once)
+        port, stop = serve(stream, port=0)
+        wait_for(lambda: stream.health()["alarms"])
+        (alarm,) = stream.health()["alarms"]
+        assert (alarm["part"], alarm["name"], alarm["error"]) == ("source", "http", "SystemExit: 3")
+        wait_for(lambda: not stream.health()["alarms"])
+    until = time.monotonic() + 20.0
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/health") as response:
+                assert json.loads(response.read())["alarms"] == []
+            break
+        except urllib.error.URLError:
+            time.sleep(0.05)
+    else:
+        raise AssertionError("the server is not back")
+    stop()
+    assert stream.sources.failed == []
+    stream.close()
+    assert stream.ended.wait(10.0)
