@@ -20,7 +20,13 @@ from service.lines import balanced, line
 # Seconds after which an event without an answer is sent again.
 AGAIN = 4.0
 # Largest size of a file of the process, bytes: a recording is then as on a full disk. Checkpoints are smaller.
-ROOM = 1 << 23
+ROOM = 2_500_000
+# A program that runs its arguments with this limit.
+LIMITED = f"""
+import os, resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, ({ROOM}, {ROOM}))
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
 
 
 def free_port():
@@ -51,13 +57,12 @@ class Service:
 
     def start(self):
         """Start the process, and wait until it is ready."""
-        words = [sys.executable, "-m", "optloc.cli", "live", "site.toml", "--state", "s.state", "--every", "1 s"]
+        words = [sys.executable, "-c", LIMITED, "-m", "optloc.cli", "live", "site.toml"]
+        words += ["--state", "s.state", "--every", "1 s"]
         words += ["--record", f"record{self.starts}.ndjson", "--http", str(self.http)]
         words += ["--mqtt", f"mqtt://127.0.0.1:{self._broker.port}/t", "--zmq", f"pull+tcp://127.0.0.1:{self.pull}"]
         self.starts += 1
-        self.process = subprocess.Popen(
-            words, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=_limit
-        )
+        self.process = subprocess.Popen(words, cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         ready = threading.Event()
         self._threads = [
             threading.Thread(target=self._read_answers, args=(self.process.stdout,), daemon=True),
@@ -126,13 +131,6 @@ class Service:
                     self._check(json.loads(each)["health"])
             elif b"Traceback" in each:
                 self.errors.append(each.decode())
-
-
-def _limit():
-    """Limit the size of the files of a process that starts."""
-    import resource
-
-    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, ROOM))
 
 
 class Sender:
