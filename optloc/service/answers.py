@@ -110,7 +110,9 @@ def _alternatives(fix: Fix) -> dict[int, list[Record]]:
 
 
 def _add_exceptions(record: Record, event: Event) -> None:
-    """Add the unusual properties of an event: client, closing reason, revision, conflict, target."""
+    """Add the properties of an event that not all events have: client, time, closing reason, revision, and others."""
+    if event.when is not None:
+        record.setdefault("time", event.when * 1e-12)
     if _id_of(event) != event.name:
         record |= shown_name(event.name)
     if event.closed != "whole":

@@ -330,8 +330,8 @@ class Events:
     def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
         """Handle rows that arrive after their event has closed: count them, send notes, or answer again.
 
-        A receiver gets the answer of the event; a line with other rows or values is refused. The result is as in
-        `take`.
+        A receiver gets the answer of the event; a line with other rows or values is refused. The result is as
+        in `take`.
         """
         event, counts = self.closed[message.event], self.metrics.counts
         if event is None:

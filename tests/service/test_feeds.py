@@ -1,0 +1,98 @@
+"""Feeds of other programs in the default two phases: they carry the proven fix, and parsers of others read them."""
+
+import json
+from xml.etree import ElementTree as ET
+
+import pytest
+from service.lines import Answers, arrivals, differences, line, solved
+
+from optloc.service.stream import Settings, Stream
+
+COUNT = 3
+TIME = 1_700_000_000.25
+
+
+@pytest.fixture(scope="module")
+def z(on_earth):
+    return differences(on_earth, arrivals(on_earth, COUNT))
+
+
+@pytest.fixture(scope="module")
+def truth(on_earth, z):
+    """Return latitudes and longitudes (degrees) and heights (m) of the fixes."""
+    fix = solved(on_earth, z)[1]
+    return fix.latlon[:, 0], fix.latlon[:, 1], fix.frame.to_geodetic(fix.position)[2]
+
+
+def feed(site, z, form, **settings):
+    """Return the output of a stream in a format."""
+    out = Answers()
+    stream = Stream(site, Settings(**({"format": form, "shed": False, "deadline": 1e6} | settings)), out)
+    lines = [line(event=str(i), z=row, target=f"T{i}", time=TIME + i) for i, row in enumerate(z.tolist())]
+    stream.inbox.put(stream.lines(lines, "test"))
+    stream.close()
+    assert stream.ended.wait(60.0)
+    return out.data
+
+
+def test_cursor_on_target_has_a_pending_event_and_then_its_update(on_earth, z, truth):
+    events = [ET.fromstring(each) for each in feed(on_earth, z, "cot").splitlines()]
+    for i in range(COUNT):
+        pending, judged = [each for each in events if each.get("uid") == f"optloc.T{i}"]
+        assert (pending.get("type"), judged.get("type")) == ("a-p-G", "a-u-G")
+        assert judged.get("time") >= pending.get("time")
+        point = judged.find("point")
+        assert float(point.get("lat")) == pytest.approx(truth[0][i], abs=1e-8)
+        assert float(point.get("ce")) < 100.0 < float(pending.find("point").get("ce"))
+        assert judged.find("detail/remarks").text.startswith("ok;")
+
+
+def test_a_parser_of_cursor_on_target_reads_the_update(on_earth, z, truth):
+    takproto = pytest.importorskip("takproto", reason="needs takproto")
+    last = feed(on_earth, z, "cot").decode().splitlines()[-COUNT:]
+    found = {event.uid: event for event in (takproto.parse_proto(takproto.xml2proto(each)).cotEvent for each in last)}
+    for i in range(COUNT):
+        event = found[f"optloc.T{i}"]
+        assert (event.type, event.how, event.detail.contact.callsign) == ("a-u-G", "m-f", f"T{i}")
+        assert event.startTime == round(1000 * (TIME + i))
+        assert (event.lat, event.lon) == pytest.approx((truth[0][i], truth[1][i]), abs=1e-8)
+        assert event.hae == pytest.approx(truth[2][i], abs=1e-3)
+        assert event.ce < 100.0
+
+
+def test_nmea_has_one_judged_position_for_each_event(on_earth, z, truth):
+    pynmea2 = pytest.importorskip("pynmea2", reason="needs pynmea2")
+    found = [pynmea2.parse(each, check=True) for each in feed(on_earth, z, "nmea").decode().splitlines()]
+    assert [each.sentence_type for each in found] == ["GGA", "GST"] * COUNT
+    for i, (place, spread) in enumerate(zip(found[::2], found[1::2], strict=True)):
+        assert place.gps_qual == 1
+        assert place.timestamp.strftime("%H:%M:%S.%f") == f"22:13:2{i}.250000"
+        assert (place.latitude, place.longitude) == pytest.approx((truth[0][i], truth[1][i]), abs=1e-8)
+        assert place.altitude + float(place.geo_sep) == pytest.approx(truth[2][i], abs=1e-3)
+        assert 0.0 < spread.std_dev_minor < spread.std_dev_major < 100.0
+
+
+def test_aircraft_and_geojson_have_the_fix_twice_and_then_judged(on_earth, z, truth):
+    planes = [json.loads(each) for each in feed(on_earth, z, "aircraft").splitlines()]
+    features = [json.loads(each) for each in feed(on_earth, z, "geojson").splitlines()]
+    for i in range(COUNT):
+        assert [each["status"] for each in planes if each["hex"] == f"T{i}"] == ["unproven", "ok"]
+        first, last = [each for each in features if each["properties"]["target"] == f"T{i}"]
+        assert (first["properties"]["status"], last["properties"]["status"]) == ("unproven", "ok")
+        assert last["properties"]["proof"] == "global"
+        assert last["properties"]["ellipse95_1"] > 0.0
+        assert last["geometry"] == first["geometry"]
+        assert last["geometry"]["coordinates"][1] == pytest.approx(truth[0][i], abs=1e-9)
+
+
+@pytest.mark.parametrize(("phases", "count"), [("one", 1), ("fix", 1), ("two", 2)])
+def test_each_phase_is_one_line(on_earth, z, phases, count):
+    assert len(feed(on_earth, z, "cot", phases=phases).splitlines()) == count * COUNT
+    assert feed(on_earth, z, "nmea", phases=phases).count(b"GGA") == COUNT
+
+
+def test_a_proof_that_is_given_up_still_updates_the_feed(on_earth, z):
+    """With no time for proofs, the last line of each event repeats the first fix with its status."""
+    found = [json.loads(each) for each in feed(on_earth, z, "aircraft", deadline=0.0).splitlines()]
+    assert [each["status"] for each in found].count("unproven") == 2 * COUNT
+    assert feed(on_earth, z, "nmea", deadline=0.0).count(b",0,00,") == COUNT
