@@ -1,7 +1,7 @@
 """Supervision of the sources of a stream: each source runs in a thread, and starts again after an error.
 
-A source that fails is one line with its name, an alarm in health and metrics, and a part of the exit code until it
-works again.
+A source that fails is one line with its name. Until it works again, it is an alarm in health and metrics, and sets the
+exit code.
 """
 
 from __future__ import annotations
