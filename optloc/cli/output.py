@@ -17,18 +17,8 @@ from rich.text import Text
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
-<<<<<<< HEAD
-from optloc.base.outputs import claim, is_stream, visible
-from optloc.kernels.progress import Reporter
-||||||| ae4d274e
-from optloc.base.outputs import claim, is_stream, visible
-from optloc.base.types import Status
-from optloc.kernels.progress import Reporter
-=======
 from optloc.base.outputs import claim, is_standard_output, is_stream, visible
-from optloc.base.types import Status
 from optloc.kernels.progress import Reporter, in_notebook
->>>>>>> g2
 from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
 from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of_label

@@ -22,14 +22,8 @@ from optloc.cli.output import (
     claim_outputs,
     dumps,
     is_csv,
-<<<<<<< HEAD
     show_answer,
-||||||| ae4d274e
-    say,
-=======
-    say,
     uses_standard_output,
->>>>>>> g2
     write_picture,
     write_results,
     write_text,
@@ -152,16 +146,8 @@ def run_track(
             if as_json:
                 write_text(Path("-"), dumps(_json(loaded, columns)))
     if not quiet and not as_json:
-<<<<<<< HEAD
-        show_answer(answer_of_scans(columns, loaded.title), Screen())
+        show_answer(answer_of_scans(columns, loaded.title), Screen(stderr=on_output))
     return 0 if set(columns["status"].tolist()) <= CLEAN else 1
-||||||| ae4d274e
-        _show(loaded, columns, Screen())
-    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
-=======
-        _show(loaded, columns, Screen(stderr=on_output))
-    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
->>>>>>> g2
 
 
 def _entries(

@@ -96,7 +96,6 @@ def _present(sections: Sequence[AnswerSection]) -> tuple[AnswerSection, ...]:
 # One fix.
 
 
-<<<<<<< HEAD
 def _states(columns: Columns, fix: Fix, where: Sequence[Row], most: int) -> list[AnswerSection]:
     """Return the sections of one fix with several states: its status, and the table of its states."""
     sheet = state_sheet(columns, "", most)
@@ -104,71 +103,10 @@ def _states(columns: Columns, fix: Fix, where: Sequence[Row], most: int) -> list
     kept = [j for j, head in enumerate(sheet.head) if head != "status"]
     rows = [tuple(row[j] for j in kept) for row in sheet.rows]
     table = FixSheet("States", tuple(sheet.head[j] for j in kept), rows)
-||||||| ae4d274e
-def _use_rows(fix: Fix) -> tuple[Row, ...]:
-    """Return the rows of the first section: the status with its notes, and the sentence of the status."""
-    verdict = Status(int(fix.code))
-    noted = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
-    notes = [UNCHECKED] * bool(fix.unchecked) + [words for note, words in noted.items() if fix.has(note)]
-    return ("status", "; ".join([verdict.label, *notes])), ("", verdict.sentence)
-
-
-def _where(fix: Fix, columns: Columns, more: Sequence[Row], most: int) -> AnswerSection:
-    """Return the second section: the position of a fix with one state, or the table of several states."""
-    name: Section = "where"
-    if len(columns["x"]) > 1:
-        sheet = state_sheet(columns, "", most)
-        # The states of one fix share its status, which is in the first row of the answer.
-        kept = [j for j, head in enumerate(sheet.head) if head != "status"]
-        rows = [tuple(row[j] for j in kept) for row in sheet.rows]
-        return AnswerSection(name, tuple(more), (FixSheet("States", tuple(sheet.head[j] for j in kept), rows),))
-    rows_of_place = place_rows(columns, 0)
-    if not rows_of_place:
-        missing = NOT_DETERMINED if known_rows(fix) else _NO_POSITION
-        return AnswerSection(name, (("position", missing), *more))
-    return AnswerSection(name, (*rows_of_place, *motion_rows(columns, 0), *origin_rows(columns, 0), *more))
-
-
-def _sure_rows(fix: Fix, columns: Columns) -> tuple[Row, ...]:
-    """Return the rows of the third section: standard deviations, the 95 % radius, and valid intervals.
-
-    Without a valid position, the section has the directions and ranges that the data determine.
-    """
-=======
-def _use_rows(fix: Fix) -> tuple[Row, ...]:
-    """Return the rows of the first section: the status with its notes, and the sentence of the status."""
-    verdict = Status(int(fix.code))
-    noted = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
-    notes = [UNCHECKED] * bool(fix.unchecked) + [words for note, words in noted.items() if fix.has(note)]
-    return ("status", "; ".join([verdict.label, *notes])), ("", fix.sentence)
-
-
-def _where(fix: Fix, columns: Columns, more: Sequence[Row], most: int) -> AnswerSection:
-    """Return the second section: the position of a fix with one state, or the table of several states."""
-    name: Section = "where"
-    if len(columns["x"]) > 1:
-        sheet = state_sheet(columns, "", most)
-        # The states of one fix share its status, which is in the first row of the answer.
-        kept = [j for j, head in enumerate(sheet.head) if head != "status"]
-        rows = [tuple(row[j] for j in kept) for row in sheet.rows]
-        return AnswerSection(name, tuple(more), (FixSheet("States", tuple(sheet.head[j] for j in kept), rows),))
-    rows_of_place = place_rows(columns, 0)
-    if not rows_of_place:
-        missing = NOT_DETERMINED if known_rows(fix) else _NO_POSITION
-        return AnswerSection(name, (("position", missing), *more))
-    return AnswerSection(name, (*rows_of_place, *motion_rows(columns, 0), *origin_rows(columns, 0), *more))
-
-
-def _sure_rows(fix: Fix, columns: Columns) -> tuple[Row, ...]:
-    """Return the rows of the third section: standard deviations, the 95 % radius, and valid intervals.
-
-    Without a valid position, the section has the directions and ranges that the data determine.
-    """
->>>>>>> g2
     known = known_rows(fix)
     intervals = [] if known and not has_place(fix) else extent_rows(fix)
     return [
-        AnswerSection("use", use_rows(columns, 0)),
+        AnswerSection("use", use_rows(columns, 0, fix.sentence)),
         AnswerSection("where", tuple(where), (table,)),
         AnswerSection("how sure", (*intervals, *known)),
         AnswerSection("why not", why_rows(columns, 0)),

@@ -38,6 +38,8 @@ from optloc.show.knowledge import has_place, known_rows
 _NOTED = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
 NO_POSITION = "none"
 """Text of the position of a fix that has none."""
+KNOWN_POSITION = "known, as stated"
+"""Text of the position of a target whose position is not an unknown, such as a beacon."""
 
 
 def row_answer(
@@ -55,14 +57,15 @@ def row_answer(
         The fix of the row, if it has one state. It adds directions, ranges and intervals of fixes whose ellipse is not
         valid.
     sentence : str
-        Sentence of the status; by default the sentence of `Status`.
+        Sentence of the status; by default the sentence of the fix, or of `Status` without one.
     title : str
         Title of the answer.
     where : sequence of (str, str)
         Further rows of the section "where".
     """
+    words = sentence or ("" if fix is None else fix.sentence)
     sections = (
-        AnswerSection("use", use_rows(columns, i, sentence)),
+        AnswerSection("use", use_rows(columns, i, words)),
         AnswerSection("where", (*_where_rows(columns, i, fix), *where)),
         AnswerSection("how sure", _sure_rows(columns, i, fix)),
         AnswerSection("why not", why_rows(columns, i)),
@@ -100,8 +103,18 @@ def _where_rows(columns: Columns, i: int, fix: Fix | None) -> tuple[Row, ...]:
     """Return the rows of the second section: position, velocity and emission time."""
     place = place_rows(columns, i)
     if not place:
-        return (("position", NOT_DETERMINED if fix is not None and known_rows(fix) else NO_POSITION),)
+        return (("position", _missing_place(fix)),)
     return (*place, *motion_rows(columns, i), *origin_rows(columns, i))
+
+
+def _missing_place(fix: Fix | None) -> str:
+    """Return the text of an absent position: it is known, the data do not determine it, or the fix has none."""
+    if fix is None:
+        return NO_POSITION
+    slots = (*fix.layout.shared, *fix.layout.local)
+    if not any(slot.name.partition("[")[0] == "position" for slot in slots):
+        return KNOWN_POSITION
+    return NOT_DETERMINED if known_rows(fix) else NO_POSITION
 
 
 def _sure_rows(columns: Columns, i: int, fix: Fix | None) -> tuple[Row, ...]:
