@@ -74,8 +74,6 @@ from optloc.solvers.verdict.repeats import holds, is_repeatable, repeat
 
 # Stages of methods that can take the short path, and whether they include a proof.
 _WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
-
-
 # Reasons of fixes by status, and of curved fixes also by the kind of their chart. Other reasons contain numbers: only
 # the long path writes them.
 _SENTENCES: dict[tuple[Status, int | None], str] = {
@@ -89,7 +87,6 @@ _NOTHING = np.empty((), dtype=object)
 _NOTHING[()] = ()
 # Largest difference between the bound of a proof and the cost, in units of `equal_cost`. The bound is one unit below.
 _APART = 3.0
-
 
 # Most problems on the short path: for more problems a batch takes no longer.
 MANY = 64

@@ -48,7 +48,6 @@ from optloc.solvers.verdict.findings import (
 from optloc.solvers.verdict.minima import is_measured, station_direction, unmeasured_direction, weak_direction
 
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
-
 _SHOWN = 8  # names or numbers in a sentence: a longer list does not help
 
 
