@@ -2,6 +2,7 @@
 
 import html
 import re
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -24,6 +25,7 @@ from optloc.show.formats.markup import cot, gpx, kml
 from optloc.show.render import text_of_answer
 from optloc.tracking.entry import scan_sentence
 
+ROOT = Path(__file__).resolve().parents[1]
 ON_EARTH = [name for name in singles() if "Earth" in name]
 
 
@@ -107,3 +109,11 @@ def test_emitters_have_the_sentence_of_their_status():
     assert found.status.sentence in plain(repr(found))
     for fix in found.fixes:
         assert with_sigma(fix.position[0], fix.sigma()[0], "").strip() in text
+
+
+def test_each_sentence_is_written_once():
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "optloc").rglob("*.py")]
+    labels = ("starting", "started", "restarted", "lost", *(one.label for one in Status))
+    for sentence in {*(one.sentence for one in Status), *map(scan_sentence, labels)}:
+        start = " ".join(sentence.split()[:8])
+        assert sum(text.count(start) for text in texts) == 1, sentence

@@ -94,7 +94,7 @@ class Fix:
     reach : array (...), optional
         Greatest distance, metres, of a station from the mean of the stations; also of a target without a chart.
     labels : array (...), optional
-        Labels of the fixes, such as the index of the data frame with their measurements.
+        Labels of the fixes, such as the index of the data frame of the measurements; the index of `to_dataframe`.
     label_names : tuple
         Name of the labels, such as the name of that index, or one name for each of its levels; None for no name.
     posed : PosedAnswer, optional
@@ -284,10 +284,8 @@ class Fix:
 
         Returns
         -------
-        semi_axes : array (..., d)
-            Lengths in metres, ascending.
-        directions : array (..., d, d)
-            Unit vectors of the axes in columns.
+        semi_axes, directions : array (..., d), (..., d, d)
+            Lengths in metres, ascending, and unit vectors of the axes in columns.
         """
         from scipy.special import gammaincinv
 
@@ -321,17 +319,13 @@ class Fix:
         Returns
         -------
         dict
-            Status, position, sigma, covariance, alternatives, certificate and more by name, as in
+            Status, position, sigma (on Earth also `sigma_east`, `sigma_north`, `sigma_up`), and more by name, as in
             ``optloc fix --json``: metres and degrees, None for missing numbers. For a batch ``{"fixes": [...]}``.
-            On Earth, `sigma_east`, `sigma_north` and `sigma_up` are standard deviations, m. `multipliers` are numbers
-            in the order of `active`.
         """
         return dict(_RENDERER[0]().dict_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes it.
-
-        Its index, with its name, comes from the data frame of the measurements, see `labels`.
 
         Raises
         ------

@@ -307,10 +307,21 @@ def to_mark(record: Record, frame: Frame) -> Mark:
         name=name,
         target=name,
         time=float(record.get("time", np.nan)),
-        sentence=scan_sentence(record["status"]) if "nis" in record else "",
+        sentence=_sentence(record),
         texts=texts,
         others=tuple(others),
     )
+
+
+# The advice for an unproven fix of a file, another method, is wrong for a stream: its proof is a second answer.
+_PENDING = "The position is refined, but its proof is not finished, so another position is not excluded."
+
+
+def _sentence(record: Record) -> str:
+    """Return the sentence of the status of a record if it is not the sentence of `Status`; otherwise empty."""
+    if "nis" in record:
+        return scan_sentence(record["status"])
+    return _PENDING if record["status"] == Status.UNPROVEN.label and "proof" not in record else ""
 
 
 def _probability(each: Record) -> float:

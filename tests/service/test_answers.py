@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from optloc.base.frames import ECEF
+from optloc.base.types import Status
 from optloc.service.answers import FORMATS, Latest, join, to_aircraft, to_feature, to_line, to_mark, unproven, unsolved
 from optloc.service.events import Event
 from optloc.show.formats import FORMATS as FILE_FORMATS
+from optloc.tracking.entry import scan_sentence
 
 PLACE = {"lat_deg": 47.5, "lon_deg": 11.25, "height": 3048.0}
 X = ECEF.from_geodetic(np.radians(47.5), np.radians(11.25), 3048.0)
@@ -51,6 +53,16 @@ def test_a_proof_that_was_not_finished_keeps_the_status():
     found = unproven(event(), "deadline", FIX)
     assert (found["phase"], found["status"], found["proof"], found["why"]) == ("proof", "ok", "unknown", "deadline")
     assert "status" not in unproven(event(), "deadline", None)
+
+
+def test_an_unproven_fix_of_a_stream_waits_for_its_proof():
+    first = to_mark(FIX | {"status": "unproven"}, ECEF).words
+    assert "its proof is not finished" in first
+    assert Status.UNPROVEN.sentence not in first
+    assert Status.UNPROVEN.sentence in to_mark(FIX | {"status": "unproven", "proof": "unknown"}, ECEF).words
+    moving = FIX | {"status": "too few rows", "nis": None, "velocity": [1.0, 2.0, 3.0], "cov": np.eye(6).tolist()}
+    assert scan_sentence("too few rows") in to_mark(moving, ECEF).words
+    assert "velocity x: 1.0 ± 1.0 m/s" in to_mark(moving, ECEF).words
 
 
 def test_features_and_aircraft_have_the_place_on_earth():
