@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 # Reasons that are printed for a batch: a screen shows them. The remaining ones are counted.
 _REASONS = 10
-_NO_POSITION = "none"
+_NO_POSITION, _KNOWN = "none", "known, as stated"
 
 
 def answer_of(
@@ -123,7 +123,11 @@ def _where(fix: Fix, columns: Columns, more: Sequence[Row], most: int) -> Answer
         return AnswerSection(name, tuple(more), (FixSheet("States", tuple(sheet.head[j] for j in kept), rows),))
     rows_of_place = place_rows(columns, 0)
     if not rows_of_place:
-        missing = NOT_DETERMINED if known_rows(fix) else _NO_POSITION
+        slots = (*fix.layout.shared, *fix.layout.local)
+        if not any(slot.name.partition("[")[0] == "position" for slot in slots):
+            missing = _KNOWN
+        else:
+            missing = NOT_DETERMINED if known_rows(fix) else _NO_POSITION
         return AnswerSection(name, (("position", missing), *more))
     return AnswerSection(name, (*rows_of_place, *motion_rows(columns, 0), *origin_rows(columns, 0), *more))
 
