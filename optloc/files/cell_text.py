@@ -286,6 +286,17 @@ def _zone(name: str) -> ZoneInfo:
         raise InvalidProblem(f"there is no time zone {name[:40]!r}", "--zone", advice) from None
 
 
+def date_texts(seconds: Array) -> Array:
+    """Return seconds since 1970, UTC (m,), as ISO 8601 text in UTC, an object array (m,).
+
+    All texts have the same number of decimals: the fewest that show the times, at most six.
+    """
+    microseconds = np.round(seconds * 1e6).astype(np.int64)
+    unit = next((unit for unit, size in (("s", 10**6), ("ms", 10**3)) if not (microseconds % size).any()), "us")
+    texts = np.datetime_as_string(microseconds.astype("datetime64[us]"), unit=unit)
+    return np.char.add(texts, "Z").astype(object)
+
+
 def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
     """Return a column of times in seconds (m,); None if its numbers have no unit and so are labels.
 

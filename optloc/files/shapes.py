@@ -17,7 +17,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
-from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, is_dated, numbers
+from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, date_texts, is_dated, numbers
 from optloc.files.columns import any_unit, sigma_kind, stem, unit_of
 from optloc.files.headings import from_bow, heading_of
 from optloc.files.lone_columns import without_difference
@@ -416,8 +416,8 @@ def _with_convention(found: Readings, hints: ColumnHints, stations: ColumnPlaces
 def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
     """Return the available columns epoch, time and target (n,) of the rows of a table, by these names.
 
-    Times are in seconds. Columns of readings are left out, as are times that are the readings. With `--still`, the
-    result has at most the target: all rows are one epoch.
+    Times are in seconds, or ISO 8601 text if the table has dates. Columns of readings are left out, as are times that
+    are the readings. With `--still`, the result has at most the target: all rows are one epoch.
     """
     table, taken = roles.table, {name for one in found for name in one.columns}
     out: dict[str, Array] = {}
@@ -443,7 +443,8 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
         out["epoch"] = roles.labels("message")
     time = None if when is None else column_times(roles, when, hints.zone, hints.time_unit)
     if time is not None:
-        out["time"] = time
+        # Dates stay dates, so that labels of epochs and written files show them.
+        out["time"] = date_texts(time) if is_dated(table, str(when)) else time
     elif when is not None and hints.window is not None:
         advice = "state it with --time-unit, such as --time-unit ns"
         raise InvalidProblem(f"the unit of the times in column {when!r} is unknown", table.source, advice)

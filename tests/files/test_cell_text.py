@@ -3,9 +3,10 @@
 from decimal import Decimal
 
 import numpy as np
+import pytest
 from hypothesis import given, settings, strategies as st
 
-from optloc.files.cell_text import Decimals, numbers
+from optloc.files.cell_text import Decimals, date_texts, numbers
 from optloc.files.table import Table
 from optloc.files.words import Words, distinct, equal_rows, numbered, words_of
 
@@ -60,3 +61,15 @@ def test_distinct_is_unique():
     names, first, index = distinct(words_of(labels))
     wanted = np.unique(labels.astype(str), return_index=True, return_inverse=True)
     assert (names, first.tolist(), index.tolist()) == tuple(part.tolist() for part in wanted)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "texts"),
+    [
+        ([0.0, 1772366400.0], ["1970-01-01T00:00:00Z", "2026-03-01T12:00:00Z"]),
+        ([1772366400.25, 1772366401.0], ["2026-03-01T12:00:00.250Z", "2026-03-01T12:00:01.000Z"]),
+        ([-0.000001], ["1969-12-31T23:59:59.999999Z"]),
+    ],
+)
+def test_times_become_dates_with_the_fewest_decimals(seconds, texts):
+    assert date_texts(np.array(seconds)).tolist() == texts

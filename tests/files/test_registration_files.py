@@ -299,8 +299,8 @@ def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
     one, two = load(path), load(DEMO)
     assert one.structure == two.structure
     np.testing.assert_array_equal(one.z, two.z)
-    known = copied(tmp_path, lambda text: text.replace('[target]\nmotion = "static"\n', blocks("toml")[1]))
-    assert load(known).motions[0].known.tolist() == [[[200e3, 300e3, 0.0]]]
+    (beacon := tmp_path / "beacon.toml").write_text(blocks("toml")[1])
+    assert load(beacon).motions[0].known.tolist() == [[[1000.0, 2000.0]]]
 
 
 @pytest.mark.slow

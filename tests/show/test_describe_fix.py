@@ -7,6 +7,7 @@ import pytest
 from show.answers import batch, singles, states
 from show.ranging import ranged
 
+from optloc import Motion, assemble, measured, solve, with_bias
 from optloc.base.records import join
 from optloc.base.types import NOTES, Status
 from optloc.show.describe_fix import answer_of
@@ -28,6 +29,14 @@ def test_what_each_section_has():
     assert answer.section("why not").rows == ()
     labels = [label for label, _ in answer.section("details").rows]
     assert labels == ["chi-square", "certificate", "95 % ellipse", "CEP50, CEP95", "x", "y", "stages"]
+
+
+def test_a_known_position_is_not_missing():
+    rows = measured("range", [500.0, 700.0], a=[0, 1], sigma=1.0)
+    beacon = Motion(known=np.array([[[300.0, 400.0]]]))
+    problem = assemble([[0.0, 0.0], [900.0, 0.0]], rows, motions=(beacon,))
+    answer = answer_of(solve(with_bias(problem, "late", per="station")))
+    assert answer.section("where").rows == (("position", "known, as stated"),)
 
 
 def test_a_direction_takes_the_place_of_a_position():
