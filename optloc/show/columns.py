@@ -59,14 +59,19 @@ def records(columns: Columns) -> list[dict[str, Any]]:
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
-def with_level_sigmas(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a row with `sigma_east`, `sigma_north` and `sigma_up`, m, if it is on Earth.
+def json_rows(columns: Columns) -> list[dict[str, Any]]:
+    """Return the rows of a table of fixes as dictionaries for JSON.
 
-    A standard deviation without a covariance is None.
+    On Earth they also have `sigma_east`, `sigma_north` and `sigma_up`, m, None without a covariance. The multipliers,
+    which are text in a table, are left out: `fix_detail` has them as numbers.
     """
-    found = {name: record[f"cov_{2 * axis}"] for axis, name in _LEVEL.items() if f"cov_{2 * axis}" in record}
-    # A constraint that holds a coordinate can leave a negative rounding error as its variance.
-    return record | {f"sigma_{name}": None if v is None else max(v, 0.0) ** 0.5 for name, v in found.items()}
+    rows = []
+    for row in records({name: values for name, values in columns.items() if name != "multipliers"}):
+        found = {name: row[f"cov_{2 * axis}"] for axis, name in _LEVEL.items() if f"cov_{2 * axis}" in row}
+        # A constraint that holds a coordinate can leave a negative rounding error as its variance.
+        sigmas = {f"sigma_{name}": None if v is None else max(v, 0.0) ** 0.5 for name, v in found.items()}
+        rows.append(row | sigmas)
+    return rows
 
 
 def join_tables(parts: Sequence[Columns]) -> Columns:

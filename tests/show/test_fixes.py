@@ -9,7 +9,7 @@ from show.answers import batch
 from show.ranging import ranged
 
 import optloc
-from optloc.show.columns import fix_columns, fix_detail
+from optloc.show.columns import fix_columns, fix_detail, json_rows
 from optloc.show.fixes import dict_of, frame_of, geojson_of, html_of, in_order_of_answer, text_of
 from optloc.show.formats.marks import Results
 
@@ -85,3 +85,6 @@ def test_a_dictionary_has_numbers_of_multipliers_and_sigmas_along_east_and_north
     (one,) = held.active[()]
     assert dict_of(held)["multipliers"] == [one.multiplier]
     assert one.multiplier > 0.0
+    (row,) = json_rows(fix_columns(held))
+    assert "multipliers" in fix_columns(held)
+    assert "multipliers" not in row
