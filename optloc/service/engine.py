@@ -303,10 +303,11 @@ class Engine:
         self._give_up(rejected, "skipped: load")
 
     def _give_up(self, items: Sequence[Pending], why: str) -> None:
-        """Answer events without their proofs; `why` is "deadline" or "skipped: load".
+        """Answer events without their proofs, and count them; `why` is "deadline" or "skipped: load".
 
         Events without an answer of the first phase are fixed now.
         """
+        self._metrics.add("overdue" if why == "deadline" else "skipped", len(items))
         for group in _grouped([item for item in items if item.before is None]):
             for event, record in zip(group.events, self._fixed(group, None), strict=True):
                 self._answer(event, record if "error" in record else record | unproven(event, why, None), last=True)

@@ -34,6 +34,8 @@ COUNTS = {
     "dropped": "messages of a broker dropped because the input queue was full",
     "refused": "requests refused because the input queue was full",
     "unsolvable": "events whose rows give no problem, or have names that the site does not have",
+    "skipped": "proofs skipped because too many waited",
+    "overdue": "proofs given up at their deadline",
     "unwritable": "answers that could not be written in the output format, or passed to a receiver",
     "tracked": "events used in a track",
     "unordered": "events refused because a later event of their track came first",

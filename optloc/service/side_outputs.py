@@ -1,4 +1,4 @@
-"""Outputs beside the answers: the recording, the checkpoints and standard error. They never stop the stream.
+"""Further outputs than the answers: the recording, the checkpoints and standard error. They never stop the stream.
 
 Each output has a bounded queue and a thread that writes it. If the queue is full, the oldest waiting entries are
 dropped and counted. If writing fails, the thread writes again after a growing delay.
@@ -20,7 +20,7 @@ T = TypeVar("T")
 # Size of the entries that are written together, bytes: on a nearly full disk, a part of a large queue still fits.
 _TOGETHER = 1 << 16
 PATIENCE = 5.0
-"""Seconds for which the end of the stream waits for an output, such as a pipe that nobody reads."""
+"""Seconds for which the end of the stream waits for an output, such as a pipe without a reader."""
 
 
 class SideOutput(Generic[T]):

@@ -22,7 +22,7 @@ _UNCOUNTED = 0.98
 _TRIES = 3
 # Seconds between two looks at whether a source must end.
 _LOOK = 0.2
-# Seconds after which MQTT asks a silent broker whether it is still there.
+# Seconds after which MQTT tests the connection to a silent broker.
 _KEEPALIVE = 30
 
 

@@ -78,8 +78,8 @@ def _log_handlers() -> list[Any]:
 def _writer(file: Any) -> Callable[[Sequence[str]], None]:
     """Return a function that writes texts to a text file.
 
-    It writes to the number of the file if there is one. The lock of the file is then not held while the reader does not
-    read, so the end of the process does not wait for this lock.
+    It writes to the number of the file if there is one. The lock of the file is then free while a write waits, so the
+    process can end.
     """
     try:
         number = file.fileno()

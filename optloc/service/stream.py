@@ -31,7 +31,7 @@ from optloc.service.replies import Replies
 from optloc.service.side_outputs import SideOutput
 from optloc.service.site import Site, UnknownName, read_site
 from optloc.service.stream_files import StreamFiles
-from optloc.service.supervisor import LineSource, Supervisor, Watch
+from optloc.service.supervisor import LineSource, RunningSource, Supervisor, Watch
 from optloc.service.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.service")
@@ -201,9 +201,9 @@ class Stream:
         found = [(i, *converted(adapter, each)) for i, each in enumerate(data, first) if ticket or each.strip()]
         return [QueuedLine(each, i, source, now, when, ticket, track, fault) for i, each, fault in found]
 
-    def start(self, source: LineSource) -> None:
+    def start(self, source: LineSource) -> RunningSource:
         """Read a source in a separate thread, and again after an error."""
-        self.sources.start(source)
+        return self.sources.start(source)
 
     def _watch(self, watch: Watch) -> None:
         """Show the state of a source in health and metrics."""

@@ -1,7 +1,7 @@
 """Supervision of the sources of a stream: each source runs in a thread, and starts again after an error.
 
-A source that fails is one line with its name, an alarm in health and metrics, and a part of the exit code until it
-works again.
+A source that fails is one line with its name. Until it works again, it is an alarm in health and metrics, and sets the
+exit code.
 """
 
 from __future__ import annotations
@@ -69,6 +69,21 @@ class LineSource:
     tries: float = inf
 
 
+@dataclass(frozen=True, slots=True)
+class RunningSource:
+    """A source with its state and its thread."""
+
+    source: LineSource
+    watch: Watch
+    thread: Thread
+
+    def stop(self) -> None:
+        """End the source, and wait some seconds for its thread."""
+        self.watch.stopping.set()
+        if not self.source.is_last:  # a read of standard input cannot be interrupted
+            self.thread.join(_PATIENCE)
+
+
 class Supervisor:
     """Threads of all sources of a stream.
 
@@ -92,28 +107,28 @@ class Supervisor:
         watched: Callable[[Watch], None] = lambda watch: None,
     ) -> None:
         self._close, self._report, self._clock, self._watched = close, report, clock, watched
-        self._running: list[tuple[LineSource, Watch, Thread]] = []
+        self._running: list[RunningSource] = []
 
-    def start(self, source: LineSource) -> None:
-        """Run a source in a separate thread until it ends, is given up, or `stop` is called."""
+    def start(self, source: LineSource) -> RunningSource:
+        """Run a source in a separate thread until it ends, is given up, or is stopped."""
         watch = Watch(source.name, self._clock, self._report)
         self._watched(watch)
         thread = Thread(target=self._run, args=(source, watch), name=f"optloc {source.name}", daemon=True)
-        self._running.append((source, watch, thread))
+        self._running.append(running := RunningSource(source, watch, thread))
         thread.start()
+        return running
 
     def stop(self) -> None:
         """End all sources, and wait some seconds for each."""
-        for _, watch, _ in self._running:
-            watch.stopping.set()
-        for source, _, thread in self._running:
-            if not source.is_last:  # a read of standard input cannot be interrupted
-                thread.join(_PATIENCE)
+        for running in self._running:
+            running.watch.stopping.set()
+        for running in self._running:
+            running.stop()
 
     @property
     def failed(self) -> list[str]:
         """Return the names of the sources that do not work."""
-        return [watch.name for _, watch, _ in self._running if watch.alarm is not None]
+        return [running.watch.name for running in self._running if running.watch.alarm is not None]
 
     def _run(self, source: LineSource, watch: Watch) -> None:
         """Run a source, and again after each error with a growing delay (the thread of the source)."""
@@ -122,7 +137,7 @@ class Supervisor:
             try:
                 source.run(watch)
                 break
-            except Exception as error:  # any error of a source is an alarm, and no error may end its thread
+            except (Exception, SystemExit) as error:  # any error is an alarm; a library may call sys.exit
                 LOG.debug("source %s failed", source.name, exc_info=error)
                 tries = tries + 1 if watch.alarm is not None else 1
                 watch.fails(sentence(error))

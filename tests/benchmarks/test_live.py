@@ -1,4 +1,4 @@
-"""What a stream does in a second of processor time, and how long an answer takes at 200 events a second.
+"""What a stream does in a second of processor time, and how long an answer takes at 200 and 1000 events a second.
 
 Rates are of processor time; beside other work the latencies are not those of the stream alone. Run it with ``-s``.
 """
@@ -8,10 +8,12 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 
 import pytest
+from benchmarks.test_latency import general
 from data.windows import report
-from service.lines import Answers, arrivals, differences, line, site_in, slowed
+from service.lines import Answers, arrivals, balanced, differences, line, site_in, slowed
 
 from optloc.service.command import _threads
 from optloc.service.stream import Settings, Stream
@@ -80,21 +82,54 @@ def test_events_in_a_second_of_one_processor(feed, name, phases, wanted):
     assert rate >= wanted
 
 
-def test_latency_at_two_hundred_events_a_second(feed):
-    lines = (feed / "whole").read_bytes().splitlines()[:4000]
+def fed(folder, rate, count):
+    """Return the health and the answers of a stream to `count` whole events that a pipe brings at a rate, in 1/s."""
+    lines = (folder / "whole").read_bytes().splitlines()[:count]
     words = [sys.executable, "-m", "optloc.cli", "live", "site.toml"]
-    with (feed / "out").open("wb") as out:
-        process = subprocess.Popen(words, cwd=feed, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.PIPE)
-        assert process.stderr.readline().startswith(b"ready")
+    with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
+        process = subprocess.Popen(words, cwd=folder, stdin=subprocess.PIPE, stdout=out, stderr=err)
+        while b"ready" not in (folder / "err").read_bytes():
+            time.sleep(0.1)
         began = time.perf_counter()
         for i, each in enumerate(lines):
-            time.sleep(max(began + i / 200.0 - time.perf_counter(), 0.0))
+            ahead = began + i / rate - time.perf_counter()
+            if ahead > 0.0:
+                process.stdin.flush()
+                time.sleep(ahead)
             process.stdin.write(each + b"\n")
-            process.stdin.flush()
         process.stdin.close()
-        health = json.loads(process.stderr.read().splitlines()[-1])["health"]
+        assert process.wait(120.0) == 0
+    health = json.loads((folder / "err").read_bytes().splitlines()[-1])["health"]
+    return health, [json.loads(each) for each in (folder / "out").read_bytes().splitlines()]
+
+
+def test_latency_at_two_hundred_events_a_second(feed):
+    health, _ = fed(feed, 200.0, 4000)
     report(f"ms: fixes {health['fix_latency_ms']}, proofs {health['proof_latency_ms']}")
     assert health["fix_latency_ms"]["p99"] <= 20.0
+
+
+def test_latency_at_a_thousand_events_a_second(feed):
+    """In solutions of SciPy of one event, measured in the same run: at most 250 for the fix and 500 for the proof."""
+    scipy = 1e-3 * general("inside")[0]
+    health, records = fed(feed, 1000.0, EVENTS)
+    scipy = 0.5 * (scipy + 1e-3 * general("inside")[0])
+    fix, proof = (health[f"{phase}_latency_ms"]["p99"] for phase in ("fix", "proof"))
+    report(f"1000 a second: S = {scipy:.3f} ms, p99 of fixes {fix / scipy:.0f} S, of proofs {proof / scipy:.0f} S")
+    assert sum(record["phase"] == "proof" for record in records) == EVENTS
+    assert fix <= 250.0 * scipy
+    assert proof <= 500.0 * scipy
+
+
+def test_at_three_thousand_events_a_second_nothing_is_lost(feed):
+    health, records = fed(feed, 3000.0, EVENTS)
+    counts = balanced(health)["stdin"]
+    assert counts == {"received": EVENTS, "answered": EVENTS, "refused": 0, "dropped": 0, "open": 0}
+    phases = Counter(record["phase"] for record in records)
+    assert phases == {"fix": EVENTS, "proof": EVENTS}
+    why = Counter(record.get("why") for record in records if record["phase"] == "proof")
+    assert (why["skipped: load"], why["deadline"]) == (health["skipped"], health["overdue"])
+    report(f"3000 a second: proofs {health['proofs']}, skipped {health['skipped']}, overdue {health['overdue']}")
 
 
 @pytest.mark.parametrize("busy", [False, True])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from optloc.problem.build import Problem
+from optloc.service.account import SETTLED
 from optloc.service.site import read_site
 from optloc.service.sources import read_lines
 from optloc.service.stream import Settings, Stream
@@ -96,6 +97,15 @@ def answers(site, lines, **settings):
     stream.close()
     assert stream.ended.wait(120.0)
     return out.records, stream.health()
+
+
+def balanced(health):
+    """Return the account of a record of health, after checks of its sums and its alarms."""
+    for source, counts in health["account"].items():
+        assert counts["received"] == sum(counts[state] for state in (*SETTLED, "open")), (source, counts)
+        assert min(counts.values()) >= 0, (source, counts)
+    assert not [alarm for alarm in health["alarms"] if alarm["part"] == "account"]
+    return health["account"]
 
 
 def solved(site, z, method="auto") -> tuple[Problem, object]:

@@ -7,21 +7,12 @@ from collections import Counter
 
 import pytest
 from service.broker import wait_for
-from service.lines import SITE, Answers, arrivals, differences, line, site_in, slowed
+from service.lines import SITE, Answers, arrivals, balanced, differences, line, site_in, slowed
 
-from optloc.service.account import OTHERS, SETTLED, STATES, Account, total
+from optloc.service.account import OTHERS, STATES, Account, total
 from optloc.service.queues import Ticket
 from optloc.service.site import FAST
 from optloc.service.stream import Settings, Stream
-
-
-def balanced(health):
-    """Return the account of a record of health, after checks of its sums and its alarms."""
-    for source, counts in health["account"].items():
-        assert counts["received"] == sum(counts[state] for state in (*SETTLED, "open")), (source, counts)
-        assert min(counts.values()) >= 0, (source, counts)
-    assert not [alarm for alarm in health["alarms"] if alarm["part"] == "account"]
-    return health["account"]
 
 
 def counts(**given):
@@ -169,6 +160,7 @@ def test_events_whose_proofs_are_skipped_are_answered(tmp_path):
     why = Counter(record.get("why") for record in out.records if record["phase"] == "proof")
     assert why["skipped: load"] > 0
     assert sum(why.values()) == 600
+    assert (why["skipped: load"], why["deadline"]) == tuple(stream.health()[key] for key in ("skipped", "overdue"))
 
 
 def test_a_full_queue_and_the_end_of_a_stream_are_counted(site, z):

@@ -1,10 +1,14 @@
 """A stream over HTTP: requests, limits, strangers' pages, the websocket, the map."""
 
 import json
+import time
+import urllib.error
+import urllib.request
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from service.broker import wait_for
 from service.conftest import ON_EARTH
 from service.lines import Answers, arrivals, ask, differences, line, solved
 from show.browser import Browser, executable, readable
@@ -260,3 +264,43 @@ def test_a_server_for_others_answers_under_its_address(site, access):
     stream.close()
     assert stream.ended.wait(10.0)
     stop()
+
+
+def test_a_server_that_ends_by_itself_is_an_alarm_and_starts_again(site):
+    import uvicorn
+
+    class Once(uvicorn.Server):
+        """A server whose first run fails."""
+
+        runs = 0
+
+        def run(self, sockets=None):
+            Once.runs += 1
+            if Once.runs == 1:
+                for each in sockets:
+                    each.close()
+                raise SystemExit(3)  # as uvicorn does if it cannot start
+            super().run(sockets)
+
+    stream = Stream(site, Settings(), Answers())
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("uvicorn.Server", Once)
+        port, stop = serve(stream, port=0)
+        wait_for(lambda: stream.health()["alarms"])
+        (alarm,) = stream.health()["alarms"]
+        assert (alarm["part"], alarm["name"], alarm["error"]) == ("source", "http", "SystemExit: 3")
+        wait_for(lambda: not stream.health()["alarms"])
+    until = time.monotonic() + 20.0
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/health") as response:
+                assert json.loads(response.read())["alarms"] == []
+            break
+        except urllib.error.URLError:
+            time.sleep(0.05)
+    else:
+        raise AssertionError("the server is not back")
+    stop()
+    assert stream.sources.failed == []
+    stream.close()
+    assert stream.ended.wait(10.0)

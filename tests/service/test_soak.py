@@ -1,4 +1,4 @@
-"""Ten minutes of a stream: latency, memory, and that nothing is lost."""
+"""Long runs of a stream: latency, memory, and that nothing is lost, also with kills, restarts and a full disk."""
 
 import json
 import subprocess
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from data.windows import report
 from service.lines import arrivals as drawn, differences, line, site_in
+from service.soak import MINUTES, soak
 
 pytestmark = pytest.mark.full
 
@@ -51,3 +52,29 @@ def test_ten_minutes_at_two_hundred_events_a_second(tmp_path):
     assert {r["event"] for r in records if r["phase"] == "proof"} >= {str(i) for i in range(SECONDS * RATE)}
     assert last - first <= 5.0
     assert health["fix_latency_ms"]["p99"] <= 20.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
+def test_garbage_restarts_a_full_disk_and_kills_lose_no_event(tmp_path):
+    """For an hour, or OPTLOC_SOAK_MINUTES: 20 kills in the first half, and memory from then on."""
+    pytest.importorskip("paho.mqtt.client")
+    pytest.importorskip("zmq")
+    pytest.importorskip("uvicorn")
+    site = site_in(tmp_path)
+    z = differences(site, drawn(site, 500)).tolist()
+    kills = 20
+    service, sent, code, (first, last) = soak(tmp_path, z, 60.0 * MINUTES, kills)
+    account, again = service.last["account"], sum(len(each) > 1 for each in service.answered.values())
+    report(f"{sent} events, {kills} kills, {service.healths} accounts; {again} answers were repeated")
+    report(f"memory {first:.1f} MB, {last:.1f} MB; alarms {sorted(service.alarms)}; at the end {account}")
+    assert service.errors == []
+    assert code == 0
+    for phase in ("fix", "proof"):
+        assert {name for name, each in service.answered if each == phase} == {f"event-{i}" for i in range(sent)}
+    # an answer that is repeated has a higher revision
+    assert not [each for each in service.answered.values() if each != sorted(set(each))]
+    assert {counts["open"] for counts in account.values()} == {0}
+    assert {("source", "mqtt"), ("output", "recording")} <= service.alarms
+    assert ("account", "lines") not in service.alarms
+    # memory grows for ten minutes, until all that is bounded is full
+    assert MINUTES < 60.0 or last <= 1.05 * first

@@ -37,8 +37,7 @@ def stream(site):
 
 def running(stream, source):
     """Run a source of a stream, and return its state."""
-    stream.start(source)
-    return stream.sources._running[-1][1]
+    return stream.start(source).watch
 
 
 # MQTT.

@@ -5,9 +5,8 @@ import threading
 import pytest
 from service.broker import wait_for
 
-from optloc.problem import InvalidProblem
 from optloc.service import supervisor
-from optloc.service.alarms import SourceLost, sentence
+from optloc.service.alarms import SourceLost
 from optloc.service.supervisor import LineSource, Supervisor
 
 
@@ -86,10 +85,3 @@ def test_the_end_of_a_source_ends_the_stream_only_if_it_is_the_last():
     kept.now.start(LineSource("stdin", lambda watch: None, is_last=True))
     assert kept.closed.wait(20.0)
     assert kept.now.failed == []
-
-
-def test_a_sentence_names_the_type_of_an_unexpected_error():
-    assert sentence(SourceLost("the broker\n is lost")) == "the broker is lost"
-    assert sentence(InvalidProblem("it is bad", "x", "change it")) == "x: it is bad; change it."
-    assert sentence(KeyError("a")) == "KeyError: 'a'"
-    assert sentence(ValueError()) == "ValueError: no reason is given"
