@@ -336,10 +336,10 @@ def run_live(file: Path, options: ServiceOptions) -> int:
         _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
         stream.sources.stop()  # so that no line comes after the last line of health
-        say(json.dumps({"health": stream.health()}))
         failed = stream.sources.failed
         if failed:
-            say(f"The stream ends with exit code {code}: {', '.join(failed)} failed.")
+            say(f"The stream ends with exit code {code}, because these sources do not work: {', '.join(failed)}.")
+        say(json.dumps({"health": stream.health()}))
     return code
 
 
