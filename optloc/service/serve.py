@@ -56,16 +56,12 @@ def serve(
         if not watch.stopping.is_set():
             raise SourceLost("the server has ended")
 
-    running = stream.start(LineSource("http", run))
-
-    def stop() -> None:
-        """Stop the server, and wait some seconds for its end."""
-        running.watch.stopping.set()
+    def interrupt() -> None:
+        """Stop the server soon."""
         for server in servers:
             server.should_exit = True
-        running.stop()
 
-    return number, stop
+    return number, stream.start(LineSource("http", run, interrupt=interrupt)).stop
 
 
 def _listener(host: str, port: int) -> socket.socket:
