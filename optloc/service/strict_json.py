@@ -51,7 +51,8 @@ def read_object(data: bytes, most: int) -> dict[str, Any]:
     ------
     InvalidProblem
         If the line is too long, is not UTF-8, or is not one JSON object (RFC 8259). Also for NaN, infinity, a key twice
-        in one object, and a lone surrogate. Also for more than `DEPTH` levels, or whole numbers of more than 100 digits.
+        in one object, and a lone surrogate. Also for more than `DEPTH` levels, or a whole number of more than 100
+        digits.
     """
     if len(data) > most:
         raise InvalidProblem(f"the line has {len(data)} bytes, more than {most}", None, "send fewer rows in a line")
