@@ -9,7 +9,8 @@ import sys
 # The libraries of the command line take half a second to load. Ctrl-C in this time ends the program without a
 # traceback.
 _NAME = os.path.basename("".join(sys.argv[:1]))  # noqa: PTH119  (pathlib takes its time, too)
-_RUNS = _NAME in {"optloc", "optloc.exe", "optloc-script.py"} or (_NAME == "-m" and "optloc.cli" in sys.orig_argv)
+_MODULES, _SCRIPTS = {"optloc", "optloc.cli"}, {"optloc", "optloc.exe", "optloc-script.py"}
+_RUNS = _NAME in _SCRIPTS or (_NAME == "-m" and not _MODULES.isdisjoint(sys.orig_argv))
 if _RUNS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
@@ -84,7 +85,7 @@ if not TYPE_CHECKING:
 watch_old_packages()
 set_renderer(lambda: import_module("optloc.show.fixes"))
 # Neighbours describe their own values; the folder `show` describes the values of the core.
-_FORMS = {"sites": "optloc.sites.site_forms"}
+_FORMS = {"sites": "optloc.sites.site_forms", "lab": "optloc.lab.lab_forms"}
 set_short_forms(lambda folder: import_module(_FORMS.get(folder, "optloc.show.short_forms")))
 # Neighbours draw their own values; the folder `show` draws the values of the core.
 set_plots(lambda folder: import_module("optloc.sites.site_plots" if folder == "sites" else "optloc.show.core_plots"))

@@ -11,15 +11,21 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "docs" / "notebooks").glob("*.ipynb"))
 # Seconds for one cell on a machine that is busy and makes machine code.
 _LIMIT = 600
-# The first run on a machine stores machine code and writes its progress to stderr.
-_PROGRESS = re.compile(r"(?:making|loading) machine code.*\n?")
 # Matplotlib prints the size of a figure, which depends on its version; the picture is next to it.
-_FIGURE = re.compile(r"<Figure size .*>")
+_FIGURE = re.compile(r"<\w*Figure size .*>")
 
 
 def executed(path, folder):
-    """Return the notebook with fresh outputs, executed in `folder`; an error in a cell raises CellExecutionError."""
-    notebook = nbformat.read(path, as_version=4)
+    """Return the notebook with fresh outputs, executed in `folder`; see `run_cells`."""
+    notebook = run_cells(nbformat.read(path, as_version=4), folder)
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)  # times
+    notebook.metadata["language_info"] = {"name": "python"}
+    return notebook
+
+
+def run_cells(notebook, folder):
+    """Return a notebook after the execution of its cells in `folder`; an error in a cell raises CellExecutionError."""
     # The kernel itself selects the backend that shows figures below their cells, unless the environment names another.
     kept = {name: os.environ.pop(name) for name in ("MPLBACKEND",) if name in os.environ}
     try:
@@ -29,16 +35,7 @@ def executed(path, folder):
         client.execute()
     finally:
         os.environ.update(kept)
-    for cell in notebook.cells:
-        cell.metadata.pop("execution", None)  # times
-        if "outputs" in cell:
-            cell.outputs = [output for output in cell.outputs if not _is_progress(output)]
-    notebook.metadata["language_info"] = {"name": "python"}
     return notebook
-
-
-def _is_progress(output):
-    return output.get("name") == "stderr" and not _PROGRESS.sub("", output.text).strip()
 
 
 def outputs(notebook):

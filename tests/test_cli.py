@@ -62,7 +62,7 @@ def test_problem_files_that_are_none(path, words, tmp_path):
     ("arguments", "words"),
     [
         (["--method", "magic"], "magic"),
-        (["--geojson", "-", "--json"], "GeoJSON"),
+        (["--geojson", "-", "--json"], "only one output"),
         (["--out", "x.docx"], "x.docx"),
         (["--out", "/no/such/place.csv"], "written"),
         (["--plot", "/no/such/place.png"], "written"),

@@ -265,7 +265,8 @@ def test_names_are_completed():
     assert result.stdout.split() == ["range", "range_rate", "range_sum"]
 
 
-def test_a_process_ends_with_the_code_and_one_line():
-    found = subprocess.run([sys.executable, "-m", "optloc.cli", "fxi"], capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("module", ["optloc", "optloc.cli"])
+def test_a_process_ends_with_the_code_and_one_line(module):
+    found = subprocess.run([sys.executable, "-m", module, "fxi"], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (2, "")
     assert found.stderr.count("\n") == 1

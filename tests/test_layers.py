@@ -79,9 +79,9 @@ def arrows(root: Path) -> list[tuple[str, int, str]]:
 
 
 def room(module: str) -> str:
-    """Return the folder of a module of optloc, empty for optloc itself and all others."""
+    """Return the folder of a module of optloc, empty for optloc itself, its entry point and all others."""
     parts = module.split(".")
-    return parts[1] if parts[0] == "optloc" and len(parts) > 1 else ""
+    return parts[1] if parts[0] == "optloc" and len(parts) > 1 and parts[1] != "__main__" else ""
 
 
 def wrong_arrows(root: Path) -> list[str]:
@@ -158,12 +158,13 @@ def test_an_import_past_a_face_is_seen(tmp_path):
     assert past_faces(root) == ["optloc.lab.a:4 imports optloc.problem.fix", "optloc.lab.a:5 imports optloc.base.types"]
 
 
-def test_no_loose_module():
-    assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py"]
+def test_no_loose_module_except_the_entry_point_of_the_command_line():
+    assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py", "__main__.py"]
+    assert {target for name, _, target in arrows(ROOT) if name == "optloc.__main__"} == {"optloc.cli.application"}
 
 
 # Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
-MODULES, LINES, BODY, RECURRING = 576, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 583, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -8,7 +8,7 @@ import re
 
 import nbformat
 import pytest
-from doc_notebooks import NOTEBOOKS, executed, outputs, pages_of, shown
+from doc_notebooks import NOTEBOOKS, executed, outputs, pages_of, run_cells, shown
 from doc_pages import DOCS
 
 from optloc.kernels.jit import enabled
@@ -64,3 +64,56 @@ def test_a_notebook_runs_and_shows_what_is_stored(path, tmp_path):
         nbformat.write(fresh, path)
     elif enabled():  # the proofs that are shown need machine code
         assert shown(fresh) == shown(stored)
+
+
+# The task "load a file, fix it, show the picture", and each picture function as the last line of its cell.
+FILE = """
+format = 2
+[stations]
+rows = [{name="A", x=0, y=0}, {name="B", x=900, y=0}, {name="C", x=900, y=800}, {name="D", x=0, y=800}]
+[[measurements]]
+kind = "range"
+unit = "m"
+sigma = 1.0
+rows = [{a="A", z=500.4}, {a="B", z=671.2}, {a="C", z=781.3}, {a="D", z=640.1}]
+"""
+BEFORE = """
+import numpy as np
+import optloc
+from optloc import show
+problem = optloc.load("site.toml")
+fix = optloc.solve(problem)
+GRID = np.linspace(0.0, 900.0, 9)
+"""
+LAST_LINES = (
+    "show.plot_fixes(problem, fix)",
+    "show.plot_residuals(problem, fix)",
+    "show.plot_landscape(problem, fix)",
+    "show.plot_convergence(problem, fix, starts=21)",
+    "bound = optloc.bounds.bound_map(problem, fix.x, GRID, GRID)\nshow.plot_bound_map(bound)",
+    "fix.plot()",
+    "problem.plot()",
+)
+
+
+@pytest.mark.slow
+def test_each_picture_is_shown_below_its_cell_without_a_magic_command(tmp_path):
+    (tmp_path / "site.toml").write_text(FILE, encoding="utf-8")
+    cells = [nbformat.v4.new_code_cell(text) for text in (BEFORE, *LAST_LINES)]
+    found = outputs(run_cells(nbformat.v4.new_notebook(cells=cells), tmp_path))
+    pictures = [number for number, output in found if "image/png" in output.get("data", {})]
+    assert pictures == list(range(1, len(cells)))  # one picture for each cell, and none twice
+    assert [output for _, output in found if output.output_type in ("stream", "error")] == []
+
+
+@pytest.mark.slow
+def test_a_cell_stores_no_progress(tmp_path):
+    work = "with {0}:\n    for k in range(24):\n        tell({1}); time.sleep(0.1)"
+    before = "import time\nfrom optloc.cli.output import bar, line, meter\n"
+    calls = (
+        ("meter('work', False) as tell", "k, 24"),
+        ("line(False) as tell", "'work'"),
+        ("bar('work', 24, False) as tell", "1"),
+    )
+    cells = [nbformat.v4.new_code_cell(before + work.format(*call)) for call in calls]
+    assert outputs(run_cells(nbformat.v4.new_notebook(cells=cells), tmp_path)) == []

@@ -100,6 +100,8 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         if self.why:
             return self.why
         status = getattr(self.fix, "status", None)
+        if getattr(self.fix, "shape", None) == () and hasattr(self.fix, "sentence"):
+            return str(self.fix.sentence)
         if status is None:
             return "There is no fix."
         # A dictionary, unlike a set, keeps the order in which the statuses occur in the batch.

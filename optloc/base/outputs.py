@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from unicodedata import category
 
 from optloc.base.errors import InvalidProblem
@@ -54,8 +56,15 @@ def make_folder(path: Path) -> None:
         raise InvalidProblem(what, str(path), "choose another place") from None
 
 
+def is_standard_output(path: Path | None) -> bool:
+    """Return whether a path is "-", the name of standard output for options."""
+    return path is not None and str(path) == "-"
+
+
 def is_stream(path: Path) -> bool:
     """Return whether a path is a pipe, a terminal or another stream, which has no file ending and is not replaced."""
+    if is_standard_output(path):
+        return True
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -81,7 +90,7 @@ def claim(*paths: Path | None, inputs: Iterable[Path] = ()) -> None:
     """
     read, seen = tuple(inputs), set[str]()
     for path in paths:
-        if path is None or str(path) == "-" or is_stream(path):
+        if path is None or is_stream(path):
             continue
         # Some systems ignore case in file names. A command must work on all systems, so names must differ in more.
         name = str(_place(path, read)).casefold()
@@ -133,6 +142,7 @@ def written(path: Path) -> Iterator[Path]:
     ----------
     path : Path
         The file. An existing file, or the file that a link leads to, is replaced. A pipe or device is written directly.
+        The path "-" is standard output, which gets the content at the end of the block.
 
     Yields
     ------
@@ -144,6 +154,13 @@ def written(path: Path) -> Iterator[Path]:
     InvalidProblem
         As for `claim`, and if the system refuses, for instance because the disk is full.
     """
+    if is_standard_output(path):
+        with TemporaryDirectory() as folder:
+            yield (temporary := Path(folder) / "output")
+            sys.stdout.flush()
+            sys.stdout.buffer.write(temporary.read_bytes())
+            sys.stdout.flush()
+        return
     if is_stream(path):
         with _invalid_if_unwritable(path):
             yield path

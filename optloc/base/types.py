@@ -453,8 +453,8 @@ _SENTENCES: dict[Status, str] = {
     "check station positions, clocks, noise levels and bounds.",
     Status.MISFIT: "Do not use it: the residuals are larger than the stated noise allows; run 'optloc check', find the "
     "wrong row with the method 'robust', or correct the noise.",
-    Status.UNPROVEN: "The position is refined, but another position is not excluded, as the certificate explains; try "
-    "the method 'auto', or accept this status with 'allow'.",
+    Status.UNPROVEN: "The position is refined, but another position is not excluded, as the reason states; add "
+    "measurements or a box around the target, or accept this status with 'allow'.",
     Status.CURVED: "The position is right, but the error ellipse in metres is not valid; use the fix's chart, its "
     "interval, or optloc.uncertainty.likelihood_region.",
     Status.UNREFINED: "This estimate is not refined or judged; append '+lsr+certify' to the method, or for a pose use "

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         dumps as dumps,
         line as line,
         say as say,
+        show_sheet as show_sheet,
         write_picture as write_picture,
         write_table as write_table,
         write_text as write_text,

@@ -363,7 +363,9 @@ def check(
         str | None, typer.Option("--method", "-m", help="Method of the fixes; choose a method that resists outliers.")
     ] = None,
     no_solve: Annotated[bool, typer.Option("--no-solve", help="Only read the file.")] = False,
-    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write the health table: .csv or .parquet.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Write the health table: .csv or .parquet; - is standard output.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
     outside: Outside = False,
     budget: Budget = None,

@@ -25,6 +25,7 @@ from optloc.cli.output import (
     claim_outputs,
     dumps,
     say_all,
+    uses_standard_output,
     write_picture,
     write_table,
     write_text,
@@ -79,7 +80,8 @@ def run_check(
     # A file without measured values is valid here: you can check the geometry before a campaign.
     outputs = partial(claim_outputs, table=options.out, picture=options.plot, inputs=[file])
     outputs()  # check twice: before the reader spends time on a long table, and after it has recorded all input files
-    loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
+    on_output = uses_standard_output(options.out, as_json=as_json)
+    loaded = read_problem(file, table, values=False, quiet=quiet or as_json, on_error=on_output)
     outputs()
     found = summary(loaded)
     checked = _health(loaded, options, quiet or as_json)
@@ -94,11 +96,12 @@ def run_check(
         sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
             sheet.add_row(name.replace("_", " "), _spell(value))
-        Screen().print(sheet)
+        screen = Screen(stderr=on_output)
+        screen.print(sheet)
         if checked is not None:
-            _show_health(checked, Screen())
-            say_all(Screen(), tell_level(checked.level, late=checked.late))
-        show_advice(advice, Screen())
+            _show_health(checked, screen)
+            say_all(screen, tell_level(checked.level, late=checked.late))
+        show_advice(advice, screen)
     return 1 if found["epochs_with_too_few_rows"] else 0
 
 

@@ -26,7 +26,7 @@ from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.show import columns as tables
 from optloc.show.answer_sheets import MOST_ROWS
-from optloc.show.columns import Columns, fix_detail, level_covariance, records
+from optloc.show.columns import Columns, fix_detail, level_covariance, records, with_level_sigmas
 from optloc.show.describe_fix import answer_of
 from optloc.show.fix_answer import FixAnswer
 from optloc.show.formats.marks import Results
@@ -249,7 +249,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     """
     from optloc.uncertainty.radii import accuracy
 
-    frame, rows = found.loaded.problem.frame, records(found.columns)
+    frame, rows = found.loaded.problem.frame, [with_level_sigmas(row) for row in records(found.columns)]
     searched = found.apart and found.fix.explanations is not None
     groups = epoch_groups(found.loaded.problem) if searched else ()
     per_fix = [

@@ -29,6 +29,7 @@ from optloc.cli.output import (
     say,
     say_all,
     show_answer,
+    uses_standard_output,
     write_picture,
     write_results,
     write_text,
@@ -87,9 +88,7 @@ def run_fix(
     grouping of `--noise-from-data`, and None leaves the noise as stated. `rescale` applies one common factor to it.
     `late` fixes with a loss for late rows, and `explain` fixes again with the most likely systematic error.
     """
-    on_output = geojson_path is not None and str(geojson_path) == "-"
-    if as_json and on_output:
-        raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
+    on_output = uses_standard_output(out, geojson_path, html, as_json=as_json)
     claim(out, geojson_path, html, plot, inputs=[file])  # before a long table is read
     read = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, results=(out, read.problem.frame), picture=plot, inputs=[file])

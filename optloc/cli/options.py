@@ -264,13 +264,15 @@ Out = Annotated[
     typer.Option(
         metavar="OUT",
         help="Write all results: .csv, .parquet, .geojson, .kml, .gpx, .cot, .nmea, .yaml (ROS) or .g2o; see "
-        "[bold]optloc list formats[/bold].",
+        "[bold]optloc list formats[/bold]. - is standard output, as CSV.",
     ),
 ]
 Html = Annotated[
     Path | None,
     typer.Option(
-        "--html", metavar="OUT.html", help="Write an HTML page with an interactive map and a list of the positions."
+        "--html",
+        metavar="OUT.html",
+        help="Write an HTML page with an interactive map and a list of the positions; - is standard output.",
     ),
 ]
 Allow = Annotated[

@@ -17,12 +17,11 @@ from rich.text import Text
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
-from optloc.base.outputs import claim, is_stream, visible
-from optloc.base.types import Status
-from optloc.kernels.progress import Reporter
+from optloc.base.outputs import claim, is_standard_output, is_stream, visible
+from optloc.kernels.progress import Reporter, in_notebook
 from optloc.show.answer_sheets import UNCHECKED_MARK
 from optloc.show.columns import Columns, plain
-from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of
+from optloc.show.fix_answer import TEXT_COLUMNS, FixAnswer, FixSheet, advice_lines, verdict_of_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +40,11 @@ class Screen(Console):
     def __init__(self, *, stderr: bool = False, quiet: bool = False) -> None:
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False)
 
+    @property
+    def shows_bars(self) -> bool:
+        """Return whether it can show progress bars: on a terminal, but not in the output of a notebook's cell."""
+        return self.is_terminal and not in_notebook()
+
     def render_str(self, text: str, **style: Any) -> Text:
         """Return printable text, with control characters as escapes."""
         return super().render_str(visible(text), **style)
@@ -55,8 +59,8 @@ def say(console: Console, line: str) -> None:
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-# Least width of a column of words, which wrap.
-_LEAST = 8
+# Least width of a column of words: words up to the second width are not split, longer words are.
+_LEAST, _WORD = 8, 14
 _COLOURS = {"good": "green", "care": "yellow", "bad": "red"}
 
 
@@ -77,11 +81,14 @@ def show_sheet(sheet: FixSheet, console: Console, colour: str = "") -> None:
     table = Table(title=sheet.title or None, title_justify="left", show_header=bool(sheet.head), min_width=width)
     needed = 1
     for place, name in enumerate(sheet.head):
-        cells_of_column = [row[place] for row in sheet.rows]
+        cells_of_column = [line for row in sheet.rows for line in row[place].splitlines()]
         numeric = name not in TEXT_COLUMNS
         # A number on two lines is misread. So a table that is too wide for the screen continues beyond its edge.
-        least = max(map(len, cells_of_column), default=0) if numeric else _LEAST
-        table.add_column(name, justify="right" if numeric else "left", min_width=least)
+        words = max((len(word) for line in cells_of_column for word in line.split()), default=0)
+        least = max(map(len, cells_of_column), default=0) if numeric else min(max(words, _LEAST), _WORD)
+        # Headings wrap between words only: a part of a word cannot be read.
+        least = max(least, *map(len, name.split()), 1)
+        table.add_column(name, justify="right" if numeric else "left", min_width=least, overflow="fold")
         needed += least + 3
     for number, row in enumerate(sheet.rows):
         cells: list[str | Text] = list(row)
@@ -98,7 +105,7 @@ def _status_colour(label: str) -> str:
     """Return the colour of a status: green for ok, yellow for other answers, red for no answer; "" for no status."""
     if not label:
         return ""
-    return _COLOURS[verdict_of(Status[label.upper().replace(" ", "_")])]
+    return _COLOURS[verdict_of_label(label)]
 
 
 def say_all(console: Console, sentences: Sequence[str]) -> None:
@@ -115,7 +122,7 @@ def dumps(value: Any) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, or standard output for the path "-"; raise InvalidProblem if that fails."""
-    if str(path) == "-":
+    if is_standard_output(path):
         sys.stdout.write(text + "\n")
         return
     outputs.write_text(path, text + "\n")
@@ -141,6 +148,17 @@ def write_results(path: Path, results: Results) -> None:
 def is_csv(path: Path) -> bool:
     """Return whether a table is written as CSV; streams without an ending, such as a pipe, get CSV too."""
     return path.suffix.lower() == ".csv" or is_stream(path)
+
+
+def uses_standard_output(*paths: Path | None, as_json: bool = False) -> bool:
+    """Return whether one of the outputs, or JSON, goes to standard output; raise InvalidProblem if several do.
+
+    The command then prints its text for people to standard error.
+    """
+    count = sum(map(is_standard_output, paths))
+    if count + as_json > 1:
+        raise InvalidProblem("only one output can go to standard output", "-", "name a file for the other outputs")
+    return count > 0
 
 
 def claim_outputs(
@@ -171,6 +189,8 @@ def claim_outputs(
         from optloc.show.formats import format_of
 
         format_of(fixes, frame)
+    if is_standard_output(picture):
+        raise InvalidProblem("a picture is no text for standard output", "-", f"name a file: {', '.join(PICTURES)}")
     if picture is not None and picture.suffix.lower() not in PICTURES and not is_stream(picture):
         what = f"pictures of type {picture.suffix or picture.name!r} are unknown"
         raise InvalidProblem(what, str(picture), f"use {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
@@ -196,7 +216,7 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
 
     # Standard output may be piped, so the bar is on standard error. One step needs no bar.
     console = Screen(stderr=True)
-    shown = console.is_terminal and not quiet and total > 1
+    shown = console.shows_bars and not quiet and total > 1
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*parts, console=console, disable=not shown, transient=True) as progress:
         task = progress.add_task(title, total=total)
@@ -211,9 +231,9 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     # `known` has the latest numbers. On a terminal the bar shows them, so the lines are muted.
     console, known = Screen(stderr=True), [0, 0]
     lines = Reporter(lambda: f"{title}: {known[0]} of about {known[1]}")
-    lines.muted = quiet or console.is_terminal
+    lines.muted = quiet or console.shows_bars
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+    with Progress(*parts, console=console, disable=quiet or not console.shows_bars, transient=True) as progress:
         task = progress.add_task(title, total=None)
 
         def tell(done: int, total: int) -> None:
@@ -235,9 +255,9 @@ def line(quiet: bool) -> Iterator[Callable[[str], None]]:
 
     console, known = Screen(stderr=True), [""]
     lines = Reporter(lambda: known[0])
-    lines.muted = quiet or console.is_terminal
+    lines.muted = quiet or console.shows_bars
     parts = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+    with Progress(*parts, console=console, disable=quiet or not console.shows_bars, transient=True) as progress:
         task = progress.add_task("", total=None)
 
         def tell(text: str) -> None:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
 from optloc.cli.crlb import vector
-from optloc.cli.output import Screen, dumps, write_text
+from optloc.cli.output import Screen, dumps, show_answer, write_text
 from optloc.files.reader import Loaded, read
 from optloc.multi_target.answer import Emitters, evenly
 from optloc.multi_target.assign import separate
 from optloc.problem.problem import Problem
+from optloc.show.describe_emitters import answer_of_emitters
 
 # Largest number of digits for a number of emitters; no file has more rows.
 _DIGITS = 12
@@ -48,7 +47,8 @@ def run_separate(
         write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "epochs": epochs}))
     elif not quiet:
         for label, one in zip(labels, found, strict=True):
-            _show(loaded, label if len(labels) > 1 else "", one)
+            title = f"{loaded.title} {label if len(labels) > 1 else ''}".strip()
+            show_answer(answer_of_emitters(one, title), Screen())
     return 0 if all(one.status == Status.OK for one in found) else 1
 
 
@@ -84,6 +84,7 @@ def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
     """
     return {
         "status": found.status.label,
+        "sentence": found.status.sentence,
         "reason": found.reason,
         "cost": found.cost,
         "bound": found.bound,
@@ -115,35 +116,3 @@ def _names(loaded: Loaded, wanted: Any) -> list[str]:
             ends = [stations[k] for k in (block.a[i - start], block.b[i - start]) if k >= 0]
             words.append(f"{block.kind} {' - '.join(ends)} (row {int(i)})")
     return words
-
-
-def _show(loaded: Loaded, label: str, found: Emitters) -> None:
-    """Print the emitters of an epoch as a table."""
-    table = Table(title=f"{loaded.title} {label}".strip(), title_justify="left", caption_justify="left")
-    for heading in ("", "position (m)", "sigma (m)", "rows", "chi-square", "status"):
-        table.add_column(heading)
-    for cells in _rows(found):
-        table.add_row(*cells)
-    table.caption = f"{found.status.label}: {found.reason}; cost {found.cost:.1f}, at least {found.bound:.1f}"
-    Screen().print(table)
-
-
-def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
-    """Yield the cells of the table: one row for each emitter, then for each ghost."""
-    for i, fix in enumerate(found.fixes):
-        rows, status = found.rows(i), Status(int(fix.code)).label
-        yield (
-            f"emitter {i}",
-            _numbers(fix.position),
-            _numbers(fix.sigma()),
-            str(len(rows)),
-            f"{float(fix.cost):.1f}",
-            status,
-        )
-    for ghost in found.ghosts:
-        yield "ghost", _numbers(ghost.position), "", str(len(ghost.rows)), "", f"cost higher by {ghost.gap:.1f}"
-
-
-def _numbers(values: Any) -> str:
-    """Return lengths in metres as text with one decimal."""
-    return ", ".join(f"{value:.1f}" for value in values)

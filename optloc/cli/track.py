@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,9 +9,6 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import is_stream
@@ -26,7 +22,8 @@ from optloc.cli.output import (
     claim_outputs,
     dumps,
     is_csv,
-    say,
+    show_answer,
+    uses_standard_output,
     write_picture,
     write_results,
     write_text,
@@ -38,6 +35,7 @@ from optloc.files.wave_speed import WaveOptions
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
+from optloc.show.describe_track import CLEAN, answer_of_scans
 from optloc.show.formats.marks import Results
 from optloc.tracking.differences import differences
 from optloc.tracking.dynamics import Dynamics
@@ -49,11 +47,8 @@ from optloc.tracking.several_targets import alone
 from optloc.tracking.track import State
 from optloc.tracking.updates import Update, filter_of, reweighted
 
-_CLEAN = {"ok", "started", "starting"}
 # Seconds between two additions to the growing table: each addition takes a millisecond, the time of ten scans.
 _MIN_GAP = 0.1
-# Largest number of reasons on the screen; --out has all of them.
-_REASONS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +120,8 @@ def run_track(
     dynamics = dynamics_of(wanted)
     # Reject wrong names before reading the file.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
-    loaded = read_problem(file, table, more, quiet=quiet or as_json)
+    on_output = uses_standard_output(out, html, as_json=as_json)
+    loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
@@ -150,8 +146,8 @@ def run_track(
             if as_json:
                 write_text(Path("-"), dumps(_json(loaded, columns)))
     if not quiet and not as_json:
-        _show(loaded, columns, Screen())
-    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+        show_answer(answer_of_scans(columns, loaded.title), Screen(stderr=on_output))
+    return 0 if set(columns["status"].tolist()) <= CLEAN else 1
 
 
 def _entries(
@@ -294,20 +290,16 @@ def track_columns(one: TargetTrack) -> Columns:
     return columns
 
 
-def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
-    """Return an HTML page with the map of the tracks `ones`."""
+def _map(loaded: Loaded, ones: list[TargetTrack], columns: Columns) -> str:
+    """Return an HTML page with the map of the tracks `ones`, whose table is `columns`."""
     from optloc.show.maps.map_marks import scan_spots
     from optloc.show.maps.map_pages import track_page
 
-    d = loaded.problem.dimension
-    entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]
-    position = np.stack([e.updated.mean[:d] for _, _, e in entries])
-    covariance = np.stack([e.updated.cov[:d, :d] for _, _, e in entries])
-    clean = np.array([e.label in _CLEAN for _, _, e in entries])
-    scans = [
-        (name, f"{name} {label}" if len(ones) > 1 else label, e.time, e.label, e.reason) for name, label, e in entries
-    ]
-    return track_page(loaded.problem, scan_spots(loaded.problem, position, covariance, scans, clean), loaded.title)
+    pairs = zip(columns["target"].tolist(), columns["epoch"].tolist(), strict=True)
+    names = [f"{target} {label}" if len(ones) > 1 else label for target, label in pairs]
+    clean = np.isin(columns["status"].astype(str), sorted(CLEAN))
+    marks = scan_spots(loaded.problem, columns, names, clean)
+    return track_page(loaded.problem, marks, loaded.title, answer_of_scans(columns, loaded.title))
 
 
 def _write(
@@ -336,30 +328,4 @@ def _write(
         drawn = [PlottedTrack(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
         write_picture(plot_tracks(drawn, title=loaded.title), plot)
     if html is not None:
-        write_text(html, _map(loaded, ones))
-
-
-def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
-    """Print the number of scans by status, and the reasons of scans that are not ok."""
-    table = Table(title=f"{loaded.title}: {len(columns['time'])} scans", title_justify="left")
-    for name in ("target", "status", "scans", "median sigma, m", "NIS per row"):
-        table.add_column(name, justify="left" if name in ("target", "status") else "right")
-    sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
-    for (target, label), count in Counter(zip(columns["target"], columns["status"], strict=True)).items():
-        inside = (columns["target"] == target) & (columns["status"] == label)
-        tested = inside & np.isfinite(columns["nis"])
-        # Chi-square of all scans over their rows: about one if the noise is as stated.
-        rows = float(columns["rows"][tested].sum())
-        nis = f"{columns['nis'][tested].sum() / rows:.2f}" if rows else "-"
-        finite = sigma[inside][np.isfinite(sigma[inside])]
-        median = f"{np.median(finite):.3g}" if len(finite) else "-"
-        colour = "green" if label in _CLEAN else "yellow"
-        table.add_row(target, Text(label, style=colour), str(count), median, nis)
-    console.print(table)
-    with_reason = np.flatnonzero(columns["reason"] != "")
-    for i in with_reason[:_REASONS]:
-        say(
-            console, f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
-        )
-    if len(with_reason) > _REASONS:
-        say(console, f"... and {len(with_reason) - _REASONS} more; --out writes all")
+        write_text(html, _map(loaded, ones, columns))

@@ -44,17 +44,27 @@ _DATED = ("toa", "p", "s")
 _ENDS = Cache[list[tuple[int, int]]](256)
 
 
+class RowLabels(NamedTuple):
+    """Labels of the epochs of a data frame.
+
+    values: one label for each epoch. names: names of the labels, such as the name of the index; None for no name.
+    """
+
+    values: list[Any]
+    names: tuple[Any, ...]
+
+
 class StationValues(NamedTuple):
     """Values of an argument.
 
     values: values (..., m), in the unit given. keys: the station, or the pair of stations, of each value. unit: the
-    unit in a column name, or None. labels: the epochs of the rows, or None.
+    unit in a column name, or None. labels: the labels of the epochs, or None.
     """
 
     values: Array
     keys: list[Any]
     unit: str | None = None
-    labels: list[Any] | None = None
+    labels: RowLabels | None = None
 
 
 def station_values(word: str, given: Any, names: Sequence[str], reference: str | None) -> StationValues:
@@ -161,7 +171,7 @@ def _wide(word: str, frame: Any, names: Sequence[str], reference: str) -> Statio
             raise InvalidProblem(error.what, f"{word}, column {column!r}", advice) from None
     # Select columns by number, since two columns may have the same name.
     values = [_numbers(word, frame.iloc[:, i].to_numpy()) for i in range(len(columns))]
-    return StationValues(np.stack(values, axis=-1), columns, labels=list(frame.index))
+    return StationValues(np.stack(values, axis=-1), columns, labels=RowLabels(list(frame.index), (*frame.index.names,)))
 
 
 def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> StationValues:
@@ -221,9 +231,8 @@ def _of_table(word: str, frame: Any, names: Sequence[str], reference: str) -> St
         seen.add(place)
         grid[place] = value
     named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
-    return StationValues(
-        grid if epochs is not None else grid[0], list(keys), named, None if epochs is None else list(rows)
-    )
+    named_rows = None if epochs is None else RowLabels(list(rows), (epochs,))
+    return StationValues(grid if epochs is not None else grid[0], list(keys), named, named_rows)
 
 
 def _no_dates(word: str, values: Array) -> Array:

@@ -19,7 +19,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.moved import renamed
 from optloc.base.types import Amount, Band, Motion, Status
 from optloc.base.units import Conversion, Quantity, in_si
-from optloc.files.by_station import ARGUMENTS, station_values
+from optloc.files.by_station import ARGUMENTS, RowLabels, station_values
 from optloc.files.call_rows import North, Receivers, check_north, from_north, per_word, rows_of, scale_of
 from optloc.files.constraint_reader import Limit, StatedConstraints, constraints_of, stated_arguments
 from optloc.files.physics import warn_of_values
@@ -266,16 +266,16 @@ def locate(
     return _labelled(fix, made[0][1])
 
 
-def _labelled(fix: Fix, labels: list[Any] | None) -> Fix:
-    """Return fixes with the index of the data frame of the measurements as labels.
+def _labelled(fix: Fix, labels: RowLabels | None) -> Fix:
+    """Return fixes with the index of the data frame of the measurements as labels, and with its name.
 
     If the number of labels differs from the number of fixes, the fixes are returned unchanged.
     """
-    if labels is None or fix.shape != (len(labels),):
+    if labels is None or fix.shape != (len(labels.values),):
         return fix
-    as_objects = np.empty(len(labels), dtype=object)
-    as_objects[:] = labels
-    return replace(fix, labels=as_objects)
+    as_objects = np.empty(len(labels.values), dtype=object)
+    as_objects[:] = labels.values
+    return replace(fix, labels=as_objects, label_names=labels.names)
 
 
 def _texts(unit: Any) -> list[tuple[str, Any]]:
@@ -295,7 +295,7 @@ def _problem_of(
     frame: str,
     wave: Wave,
     north: North,
-) -> tuple[Problem, list[Any] | None]:
+) -> tuple[Problem, RowLabels | None]:
     """Return the problem of the arguments of `locate`, and the labels of its rows; None without labels.
 
     `given` has the measurements by the name of their argument. `wave` is the wave that converts times to lengths.
@@ -303,7 +303,7 @@ def _problem_of(
     """
     places = _PLACES.call(_receivers, stations, latlon, frame)
     rows, timed, joint = list[Measured](), list[bool](), None
-    labels: list[Any] | None = None
+    labels: RowLabels | None = None
     if any(word in PICKS for word in given):
         picks = pick_rows(given, sigma, unit, places, wave)
         rows, joint, labels = [*picks.rows], picks.covariance, picks.labels

@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import in_si
-from optloc.files.by_station import ARGUMENTS, StationValues, station_values
+from optloc.files.by_station import ARGUMENTS, RowLabels, StationValues, station_values
 from optloc.files.call_rows import Receivers, per_word, scale_of, since_first
 from optloc.files.crust import Crust, crust_of
 from optloc.files.table_import import ColumnHints
@@ -35,7 +35,7 @@ class PickRows(NamedTuple):
 
     rows: tuple[Measured, ...]
     covariance: Array | None
-    labels: list[Any] | None
+    labels: RowLabels | None
 
 
 def wave_of_picks(vp: Any, vs: Any, wave: Wave, given: Mapping[str, Any]) -> Wave:

@@ -1,12 +1,14 @@
 """A progress line every two seconds while machine code is compiled or loaded; the option `--quiet` switches it off.
 
 On a terminal, one line is overwritten. Elsewhere each line is a warning of the log ``optloc.compile``, which goes to
-standard error unless the program configures logging differently.
+standard error unless the program configures logging differently. A notebook would store each line as an output of its
+cell. So there the lines have the level "info", which logging hides by default.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable
 from threading import Lock, Thread
@@ -82,9 +84,15 @@ class Reporter:
             sys.stderr.flush()
 
 
+def in_notebook() -> bool:
+    """Return whether a notebook stores standard error as the output of a cell: in its kernel, or in a command of it."""
+    # Jupyter sets the variable for the kernel, and shell commands of cells inherit it, although they see a terminal.
+    return type(sys.stderr).__module__.partition(".")[0] == "ipykernel" or "JPY_PARENT_PID" in os.environ
+
+
 def _on_terminal() -> bool:
-    """Return whether standard error is a terminal."""
-    return sys.stderr is not None and sys.stderr.isatty()
+    """Return whether standard error is a terminal on which a line can be overwritten."""
+    return sys.stderr is not None and sys.stderr.isatty() and not in_notebook()
 
 
 def _say(text: str) -> None:
@@ -93,7 +101,7 @@ def _say(text: str) -> None:
         sys.stderr.write(_CLEAR + text)
         sys.stderr.flush()
     else:
-        _LOG.warning("%s", text)
+        _LOG.log(logging.INFO if in_notebook() else logging.WARNING, "%s", text)
 
 
 def keep_quiet(quiet: bool) -> bool:

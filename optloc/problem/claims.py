@@ -9,13 +9,27 @@ from typing import Annotated
 import numpy as np
 
 from optloc.base.records import Axes
-from optloc.base.types import Array, Certificate
+from optloc.base.types import Array, Certificate, Status
 
 PROOFS = ("", "unknown", "local", "region", "global")
 """Names of the proofs, in the order of their numbers. The first, "", means that no proof was tried."""
 UNTRIED, UNKNOWN, LOCAL, REGION, GLOBAL = range(5)
 
 _NONE = Certificate("", "", "").bound
+
+NO_PROOF_METHODS = ("", "none", "refinement")
+"""Methods of certificates of fixes for which no proof was tried."""
+
+# The advice for an unproven fix depends on what its method has already done. A method without a proof has one step
+# left. More measurements do not help if no proof covers the rows.
+_WITHOUT_PROOF = (
+    "The position is refined, but no proof was tried, so another position is not excluded; use the method 'auto', "
+    "which tries a proof, or accept this status with 'allow'."
+)
+_NOT_COVERED = (
+    "The position is refined, but no proof covers the problem, as the reason states, so another position is not "
+    "excluded; compare it with other data, or accept this status with 'allow'."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,3 +119,16 @@ def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
     """Return claims (N,): `one` where `chosen` (N,) is true, otherwise `other`; each has shape (N,) or ()."""
     pairs = ((getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
     return Claims(*(np.where(chosen, *pair) for pair in pairs))
+
+
+def sentence_of(status: Status, claims: Claims) -> str:
+    """Return the sentence of the status of one fix, with advice that its method has not yet followed.
+
+    `claims` is the certificate of the fix, each field of shape ().
+    """
+    if status is not Status.UNPROVEN:
+        return status.sentence
+    if str(claims.method) in NO_PROOF_METHODS:
+        return _WITHOUT_PROOF
+    # A proof that examined no box was not begun: the problem is outside of its scope.
+    return _NOT_COVERED if claims.proof == UNKNOWN and not claims.boxes else status.sentence

@@ -18,9 +18,10 @@ from optloc.base.plots import plot_of
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
 from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
-from optloc.problem.claims import Claims
+from optloc.problem.claims import Claims, sentence_of
 from optloc.problem.determined import Determined
 from optloc.problem.explanations import Suspect
+from optloc.problem.fix_parts import Alternatives, Stage
 from optloc.problem.layout import Layout
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
@@ -39,68 +40,6 @@ _OPEN = 100.0
 # hundredfold scale, and for lengths the distance of the outer planets.
 _OPEN_BY_UNIT = {"m/s": 299_792_458.0, "m/s^2": 299_792_458.0, "rad": 1e3, "1": 100.0, "s": 1e4}
 _OPEN_LENGTH = 1e12
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """One step of the computation of a fix.
-
-    Parameters
-    ----------
-    name : str
-        Method, for instance "gtrs" or "lsr".
-    detail : str
-        Summary of the step in a few words.
-    seconds : float
-        Wall-clock time for the whole batch.
-    """
-
-    name: str
-    detail: str
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class Active:
-    """A constraint that is active: the fix meets it with equality.
-
-    Parameters
-    ----------
-    name : str
-        Name of the constraint and its side, for instance "height upper".
-    multiplier : float
-        Lagrange multiplier, in cost per SI unit of the constrained quantity: positive at an upper bound, negative at a
-        lower bound. The gradient of the cost plus the sum of all multipliers times their gradients is zero.
-    """
-
-    name: str
-    multiplier: float
-
-
-@dataclass(frozen=True, slots=True)
-class Alternatives:
-    """Other minima of the cost, sorted by cost.
-
-    Parameters
-    ----------
-    x : array (..., q, size)
-        Parameter vectors; NaN in unused entries.
-    gap : array (..., q)
-        Cost of each minimum minus the cost of the fix; infinite in unused entries.
-    """
-
-    x: Annotated[Array, Axes(2, slots=True)]
-    gap: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
-
-    @property
-    def doubt(self) -> Array:
-        """Return the probability (..., q) that the alternative is correct, given that either it or the fix is correct.
-
-        Both have the same prior probability, and the likelihood of each is proportional to exp(-cost / 2).
-        """
-        from scipy.special import expit
-
-        return np.asarray(expit(-0.5 * self.gap))
 
 
 Index: TypeAlias = int | np.integer[Any] | slice | list[int] | Array | tuple[int | slice | Array, ...]
@@ -156,6 +95,8 @@ class Fix:
         Greatest distance, metres, of a station from the mean of the stations; also of a target without a chart.
     labels : array (...), optional
         Labels of the fixes, such as the index of the data frame with their measurements.
+    label_names : tuple
+        Name of the labels, such as the name of that index, or one name for each of its levels; None for no name.
     posed : PosedAnswer, optional
         Values, duals and solver report of a single fix from `optloc.pose`; None for other fixes.
     source : object array (...), optional
@@ -184,6 +125,7 @@ class Fix:
     reach: Annotated[Array, Axes(0)] | None = None
     source: Annotated[Array, Axes(0, empty=None)] | None = None
     labels: Annotated[Array, Axes(0, empty=None)] | None = None
+    label_names: tuple[Any, ...] = ()
     posed: PosedAnswer | None = None
     # Cached at the first use, because a program can read one certificate after the other.
     _certificates: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
@@ -381,13 +323,15 @@ class Fix:
         dict
             Status, position, sigma, covariance, alternatives, certificate and more by name, as in
             ``optloc fix --json``: metres and degrees, None for missing numbers. For a batch ``{"fixes": [...]}``.
+            On Earth, `sigma_east`, `sigma_north` and `sigma_up` are standard deviations, m. `multipliers` are numbers
+            in the order of `active`.
         """
         return dict(_RENDERER[0]().dict_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return a data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes it.
 
-        Its index comes from the data frame of the measurements, see `labels`.
+        Its index, with its name, comes from the data frame of the measurements, see `labels`.
 
         Raises
         ------
@@ -476,6 +420,11 @@ class Fix:
         for i, bits in enumerate(marks.tolist()):
             sets[i] = tuple(one for one in (*PRECEDENCE, *NOTES) if one is not Status.OK and bits & one.mark)
         return cast("tuple[Status, ...]", sets[index.reshape(self.shape)] if self.shape else sets[0])
+
+    @property
+    def sentence(self) -> str:
+        """Return the sentence of the status of a single fix, with advice that its method has not yet followed."""
+        return sentence_of(Status(int(self.code)), self.claims)
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points are in the regions that contain the target with a given probability.

@@ -44,7 +44,7 @@ def why_unsupported(problem: Problem) -> str:
 def _reasons(problem: Problem) -> Iterator[str]:
     """Yield all reasons why the proof does not cover a problem."""
     if len(problem.motions) != 1:
-        yield f"there are {len(problem.motions)} targets, but the proof covers one"
+        yield _reason_against_targets(problem)
         return
     motion = problem.motions[0]
     if motion.known is not None or not problem.layout.shares("position"):
@@ -66,6 +66,19 @@ def _reasons(problem: Problem) -> Iterator[str]:
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"
+
+
+def _reason_against_targets(problem: Problem) -> str:
+    """Return the reason against several targets, with the way to a proof if only one position is unknown."""
+    unknown, count = sum(motion.known is None for motion in problem.motions), len(problem.motions)
+    # A walk has a value at each epoch, which no mean and sigma of a file describe.
+    if unknown != 1 or any(form_of(bias).steps is not None for bias in problem.biases):
+        return f"there are {count} targets, but the proof covers one"
+    # The rows of a known target bound the biases that both targets share. The proof has no such rows, only priors.
+    return (
+        "rows of a target with a known position share biases with the other target, but the proof covers the rows of "
+        "one target; fix the known target alone, and state its biases with mean and sigma in the file of the other"
+    )
 
 
 def _reasons_against_motion(problem: Problem) -> Iterator[str]:

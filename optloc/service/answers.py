@@ -18,7 +18,7 @@ from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Frame, Problem, Status
 from optloc.service.events import Event
 from optloc.service.messages import shown_name
 from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, ellipse95, live_mark, mark_of
-from optloc.tracking import Entry
+from optloc.tracking import Entry, scan_sentence
 
 Record = dict[str, Any]
 
@@ -58,7 +58,7 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
         lat, lon, height = fix.frame.to_geodetic(np.where(known[:, None], position, 0.0))
         for name, values in (("lat_deg", np.degrees(lat)), ("lon_deg", np.degrees(lon)), ("height", height)):
             columns[name] = _known(values, known)
-    names, others = ("event", *columns), _alternatives(fix)
+    names, others, alone = ("event", *columns), _alternatives(fix), np.ravel(fix.unchecked)
     made = [
         dict(zip(names, row, strict=True))
         for row in zip((_id_of(event) for event in events), *columns.values(), strict=True)
@@ -67,6 +67,8 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
         record["alternatives"] = others.get(i, [])
         if fix.reason[i]:
             record["reason"] = fix.reason[i]
+        if alone[i]:
+            record["unchecked"] = True
         if wild[i].any():
             record["undetermined"] = ["xyz"[axis] for axis in np.flatnonzero(wild[i])]
         _add_exceptions(record, event)
@@ -284,7 +286,9 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     `record` is an answer with a position, m, in `frame`. Without a covariance in the record, the covariance is NaN.
     """
     position, d = np.array(record["position"], dtype=float), len(record["position"])
-    covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
+    covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)
+    texts = {"reason": record.get("reason", ""), "unchecked": record.get("unchecked", False)}
+    texts |= {"undetermined": "; ".join(record["undetermined"])} if "undetermined" in record else {}
     others = [
         Other(
             x := np.array(each["position"], dtype=float),
@@ -304,15 +308,16 @@ def to_mark(record: Record, frame: Frame) -> Mark:
         name=name,
         target=name,
         time=float(record.get("time", np.nan)),
+        sentence=scan_sentence(record["status"]) if "nis" in record else "",
+        texts=texts,
         others=tuple(others),
-        reason=record.get("reason", ""),
     )
 
 
 def _probability(each: Record) -> float:
     """Return the probability of an alternative relative to the fix, from its gap (difference of chi-square).
 
-    The formula is the formula of `optloc.problem.fix.Alternatives`.
+    The formula is the formula of `optloc.problem.fix_parts.Alternatives`.
     """
     return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 

@@ -50,8 +50,9 @@ def read_object(data: bytes, most: int) -> dict[str, Any]:
     Raises
     ------
     InvalidProblem
-        If the line is too long, is not UTF-8, or is not one JSON object (RFC 8259). Also for NaN, infinity, a key twice
-        in one object, a lone surrogate, more than `DEPTH` levels, and a whole number of more than 100 digits.
+        If the line is too long, is not UTF-8, or is not one JSON object (RFC 8259). Also for NaN, infinity and a key
+        that an object has twice. Also for a lone surrogate, more than `DEPTH` levels, and more than 100 digits of a
+        whole number.
     """
     if len(data) > most:
         raise InvalidProblem(f"the line has {len(data)} bytes, more than {most}", None, "send fewer rows in a line")

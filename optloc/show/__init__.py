@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         svg_text as svg_text,
         with_legend as with_legend,
     )
+    from optloc.show.fix_answer import FixSheet as FixSheet
     from optloc.show.formats import FORMATS as FORMATS, write_fixes as write_fixes
     from optloc.show.formats.marks import Mark as Mark, Other as Other, ellipse95 as ellipse95, mark_of as mark_of
     from optloc.show.maps.bound_page import map_element as map_element, map_page as map_page

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -15,9 +15,10 @@ from optloc.problem.fix import Fix
 from optloc.show.answer_texts import (
     NOT_DETERMINED,
     as_p,
-    decimals,
     finite,
-    rounded,
+    place_rows,
+    sigma_of,
+    sure_rows,
     undetermined_names,
     with_sigma,
 )
@@ -34,10 +35,8 @@ from optloc.show.fix_answer import FixSheet
 _EXPLANATIONS, _SUSPECTS, _BIASES = 8, 12, 40
 # A cost gap below this is printed as 0: both positions fit the data equally well.
 _NO_GAP = 1e-3
-# Decimals of degrees in a table: 0.1 m. A single fix has more.
-_DEGREES = 6
-# A standard deviation up to this length, m, is rounding error of a coordinate that a constraint holds.
-_HELD = 1e-5
+# Characters in a line of a table that has standard deviations in the cells: the width of a terminal.
+_WIDEST = 80
 
 MOST_ROWS = 20
 """Number of fixes that a printed table shows completely; of more, it shows the first and the last ten."""
@@ -52,6 +51,9 @@ UNCHECKED_MARK = ", unchecked"
 def state_sheet(columns: Columns, title: str, most: int = MOST_ROWS) -> FixSheet:
     """Return the table of several states, one row for each: names, position, velocity, sigma and status.
 
+    Numbers are rounded as in the text of a single fix. If the table is not too wide, coordinates have their standard
+    deviations in the same cell. Otherwise, and for degrees, one column has the standard deviations.
+
     Parameters
     ----------
     columns : dict of str to array
@@ -61,31 +63,79 @@ def state_sheet(columns: Columns, title: str, most: int = MOST_ROWS) -> FixSheet
     most : int
         Number of rows that are shown completely. Of more rows, the first and the last are shown.
     """
-    count, names = len(columns["status"]), _name_columns(columns)
-    earth = "lat_deg" in columns
-    axes = [axis for axis in "xyz" if axis in columns]
-    rates = [f"v{axis}" for axis in axes if f"v{axis}" in columns]
-    head = [
-        *(_HEADS.get(name, name) for name in names),
-        *(("latitude", "longitude", "height, m") if earth else (f"{axis}, m" for axis in axes)),
-        *(f"{name}, m/s" for name in rates),
-        "sigma, m",
-        "status",
-    ]
-    digits = {name: _decimals(columns[f"sigma_{name}"]) for name in (*axes, *rates)}
-    rises = _decimals(np.sqrt(np.maximum(columns["cov_uu"], 0.0))) if "cov_uu" in columns else 1
-    half = most // 2
-    shown = range(count) if count <= most else [*range(half), *range(count - half, count)]
-    rows = []
-    for place, i in enumerate(shown):
-        if place == half and count > most:
-            rows.append((f"... {count - most} more", *[""] * (len(head) - 1)))
-        coordinates = _earth_cells(columns, i, rises) if earth else _cells(columns, i, {a: digits[a] for a in axes})
-        moving = _cells(columns, i, {name: digits[name] for name in rates})
-        own = tuple(str(columns[name][i]) for name in names)
-        status = str(columns["status"][i]) + (UNCHECKED_MARK if columns["unchecked"][i] else "")
-        rows.append((*own, *coordinates, *moving, _sigma_text(columns, i), status))
+    count, half = len(columns["status"]), most // 2
+    shown = list(range(count)) if count <= most else [*range(half), *range(count - half, count)]
+    joined = _joined_cells(columns, shown)
+    head, rows = _split_cells(columns, shown) if joined is None or _width(*joined) > _WIDEST else joined
+    if count > most:
+        rows.insert(half, (f"... {count - most} more", *[""] * (len(head) - 1)))
     return FixSheet(title, tuple(head), rows)
+
+
+# Heads and rows of a table.
+_Table = tuple[list[str], list[tuple[str, ...]]]
+
+
+def _width(head: list[str], rows: list[tuple[str, ...]]) -> int:
+    """Return the width of a table as text, with two blanks between columns."""
+    return sum(2 + max(map(len, column)) for column in zip(head, *rows, strict=True)) - 2
+
+
+def _joined_cells(columns: Columns, shown: Sequence[int]) -> _Table | None:
+    """Return the heads and rows of a table with a number and its standard deviation in one cell; None on Earth.
+
+    `shown` are the numbers of the rows.
+    """
+    if "lat_deg" in columns:
+        return None
+    names, axes, rates = _name_columns(columns), _axes(columns), _rates(columns)
+    head = [_HEADS.get(name, name) for name in names]
+    head += [*(f"{axis}, m" for axis in axes), *(f"{name}, m/s" for name in rates), "status"]
+    rows = []
+    for i in shown:
+        cells = _cells(columns, i, (*axes, *rates))
+        rows.append((*(str(columns[name][i]) for name in names), *cells, _status_cell(columns, i)))
+    return head, rows
+
+
+def _split_cells(columns: Columns, shown: Sequence[int]) -> _Table:
+    """Return the heads and rows of a table with standard deviations in one column; `shown` are its row numbers."""
+    names, axes, rates, earth = _name_columns(columns), _axes(columns), _rates(columns), "lat_deg" in columns
+    third = "cov_uu" if earth else "cov_zz"
+    spread = ("east", "north", "up") if earth else ("x", "y", "z")
+    head = [_HEADS.get(name, name) for name in names]
+    head += ["latitude", "longitude", "height, m"] if earth else [f"{axis}, m" for axis in axes]
+    head += [f"{name}, m/s" for name in rates]
+    head += [f"sigma {', '.join(spread[: 3 if third in columns else 2])}, m", "status"]
+    rows = []
+    for i in shown:
+        place = _earth_cells(columns, i) if earth else [_before_sigma(cell) for cell in _cells(columns, i, axes)]
+        moving = [_before_sigma(cell) for cell in _cells(columns, i, rates)]
+        own = (str(columns[name][i]) for name in names)
+        rows.append((*own, *place, *moving, _sigma_cell(columns, i), _status_cell(columns, i)))
+    return head, rows
+
+
+def _axes(columns: Columns) -> list[str]:
+    """Return the names of the columns of the coordinates."""
+    return [axis for axis in "xyz" if axis in columns]
+
+
+def _rates(columns: Columns) -> list[str]:
+    """Return the names of the columns of the velocity."""
+    return [f"v{axis}" for axis in _axes(columns) if f"v{axis}" in columns]
+
+
+def _status_cell(columns: Columns, i: int) -> str:
+    """Return the status of row `i`, with a mark if it has no redundancy."""
+    alone = "unchecked" in columns and bool(columns["unchecked"][i])
+    return str(columns["status"][i]) + (UNCHECKED_MARK if alone else "")
+
+
+def _sigma_cell(columns: Columns, i: int) -> str:
+    """Return the standard deviations of row `i` as the text of a single fix has them; "-" without any."""
+    found = [text for label, text in sure_rows(columns, i) if label.startswith("sigma")]
+    return found[0].removesuffix(" m") if found else "-"
 
 
 _HEADS = {"label": "fix", "number": "fix"}
@@ -104,40 +154,29 @@ def _name_columns(columns: Columns) -> list[str]:
     return names
 
 
-def _earth_cells(columns: Columns, i: int, digits: int) -> list[str]:
-    """Return latitude and longitude, degrees, and height, metres, of row `i` as cells; "-" if not determined.
-
-    `digits` is the number of decimals of the height.
-    """
+def _earth_cells(columns: Columns, i: int) -> list[str]:
+    """Return latitude and longitude, degrees, and height, metres, of row `i` as cells; "-" if not determined."""
     if not np.isfinite(columns["lat_deg"][i]):
         return ["-"] * 3
+    units = {"latitude": " deg", "longitude": " deg", "height": " m"}
+    texts = dict(place_rows(columns, i))
+    return ["-" if texts[name] == NOT_DETERMINED else texts[name].replace(unit, "") for name, unit in units.items()]
+
+
+def _cells(columns: Columns, i: int, names: Sequence[str]) -> list[str]:
+    """Return numbers of row `i` with their standard deviations as cells; "-" if not determined."""
     undetermined = undetermined_names(columns, i)
-    cells = {
-        "north": f"{columns['lat_deg'][i]:.{_DEGREES}f}",
-        "east": f"{columns['lon_deg'][i]:.{_DEGREES}f}",
-        "up": rounded(columns["height"][i], digits),
-    }
-    return ["-" if name in undetermined else text for name, text in cells.items()]
+    return [
+        with_sigma(float(columns[name][i]), sigma_of(columns, name, i), "").strip()
+        if name not in undetermined and np.isfinite(columns[name][i])
+        else "-"
+        for name in names
+    ]
 
 
-def _cells(columns: Columns, i: int, digits: Mapping[str, int]) -> list[str]:
-    """Return numbers of row `i` as cells; "-" if not determined. `digits` has the decimals of each column by name."""
-    undetermined = undetermined_names(columns, i)
-    known = {name: name not in undetermined and bool(np.isfinite(columns[name][i])) for name in digits}
-    return [rounded(columns[name][i], many) if known[name] else "-" for name, many in digits.items()]
-
-
-def _decimals(sigma: Array) -> int:
-    """Return the number of decimals of a column from the standard deviations (n,) of its entries; 1 if all are held."""
-    known = finite(sigma)
-    known = known[known > _HELD]
-    return decimals(float(np.median(known))) if len(known) else 1
-
-
-def _sigma_text(columns: Columns, i: int) -> str:
-    """Return the root of the trace of the covariance of row `i`, m; "-" without one."""
-    sigma = _sigma({name: values[i : i + 1] for name, values in columns.items() if name.startswith("sigma_")})[0]
-    return f"{sigma:.3g}" if np.isfinite(sigma) and np.isfinite(columns["x"][i]) else "-"
+def _before_sigma(cell: str) -> str:
+    """Return the number of a cell without its standard deviation."""
+    return cell.partition(" ± ")[0]
 
 
 def _sigma(columns: Columns) -> Array:
@@ -156,8 +195,13 @@ def count_sheet(columns: Columns, title: str = "Statuses") -> FixSheet:
         # The median and the 95 % quantile of sigma, and the median p-value.
         shares = ((sigma, 0.5), (sigma, 0.95), (columns["p_value"], 0.5))
         rows.append((label, str(count), *(_quantile(values[inside], share) for values, share in shares)))
-    head = ("status", "fixes", "median sigma, m", "95 % quantile, m", "median p")
+    head = ("status", "fixes", "median sigma, m", "95 % of sigma, m", "median p")
     return FixSheet(title, head, rows)
+
+
+def median_sigma(columns: Columns, inside: Array) -> str:
+    """Return the median of the accuracy (root of the trace of the covariance, m) of the rows `inside` as text."""
+    return _quantile(_sigma(columns)[inside], 0.5)
 
 
 def _quantile(values: Array, share: float) -> str:

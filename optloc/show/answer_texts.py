@@ -8,7 +8,8 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
-from optloc.problem.fix import Active, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Active
 from optloc.show.columns import Columns, level_covariance
 from optloc.show.fix_answer import Row
 from optloc.show.origin_time import origin_text
@@ -23,9 +24,13 @@ _UNLIKELY = 1e-3
 _RATES = (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²"))
 
 # The radius is the size of one minimum. If another position is not excluded, it says nothing about the choice.
-_CONFIRMED = {Status.OK.label, Status.CURVED.label}
+# "started" is the label of the first scan of a track, whose state is a fix with status `ok`.
+_CONFIRMED = {Status.OK.label, Status.CURVED.label, "started"}
 _CONDITION = ", if this position is correct"
 _REFUTED = "not valid: the residuals are larger than the stated noise allows"
+
+CURVED_ROW = ("95 % region", "curved: the ± values are not valid; use optloc.uncertainty.likelihood_region")
+"""Row of a fix whose error is Gaussian in no known coordinates."""
 
 NOT_DETERMINED = "not determined"
 """Text of an entry that the data do not determine; see `optloc.Fix.undetermined`."""
@@ -91,8 +96,13 @@ def frame_rows(columns: Columns, i: int) -> list[Row]:
     if not np.isfinite(columns["x"][i]):
         return []
     axes, undetermined = [axis for axis in "xyz" if axis in columns], undetermined_names(columns, i)
-    numbers = [with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m") for axis in axes]
+    numbers = [with_sigma(columns[axis][i], sigma_of(columns, axis, i), "m") for axis in axes]
     return [(a, NOT_DETERMINED if a in undetermined else text) for a, text in zip(axes, numbers, strict=True)]
+
+
+def sigma_of(columns: Columns, name: str, i: int) -> float:
+    """Return the standard deviation of a column in row `i`; NaN if the table has none."""
+    return float(columns[f"sigma_{name}"][i]) if f"sigma_{name}" in columns else np.nan
 
 
 def motion_rows(columns: Columns, i: int) -> list[Row]:
@@ -100,7 +110,7 @@ def motion_rows(columns: Columns, i: int) -> list[Row]:
     undetermined, rows = undetermined_names(columns, i), []
     for letter, word, unit in _RATES:
         for axis in (axis for axis in "xyz" if f"{letter}{axis}" in columns):
-            value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
+            value, sigma = columns[f"{letter}{axis}"][i], sigma_of(columns, f"{letter}{axis}", i)
             if np.isfinite(value):
                 text = NOT_DETERMINED if f"{letter}{axis}" in undetermined else with_sigma(value, sigma, unit)
                 rows.append((f"velocity {axis}" if word == "velocity" else f"{word} {axis}", text))
@@ -125,8 +135,8 @@ def sure_rows(columns: Columns, i: int) -> list[Row]:
 
 def is_gaussian(columns: Columns, i: int) -> bool:
     """Return whether the ellipse of row `i` is valid: it is finite, and the error is Gaussian in metres."""
-    semi = [columns[name][i] for name in ("ellipse95_1", "ellipse95_2", "ellipse95_3") if name in columns]
-    return bool(np.isfinite(semi).all()) and columns["chart"][i] in {"", NAMES[CARTESIAN]}
+    chart = columns["chart"][i] if "chart" in columns else ""
+    return bool(np.isfinite(level_covariance(columns, i)).all()) and chart in {"", NAMES[CARTESIAN]}
 
 
 def _radius_rows(columns: Columns, i: int) -> list[Row]:
@@ -191,7 +201,7 @@ def extent_rows(fix: Fix) -> list[Row]:
     if fix.chart.kind == CARTESIAN:
         return _coordinate_rows(fix) if fix.chart.cut_off else []
     if fix.chart.kind != INVERSE_RANGE:
-        return [("95 % region", "curved: the ± values are not valid; use optloc.uncertainty.likelihood_region")]
+        return [CURVED_ROW]
     low, high = (float(end) for end in fix.interval("range"))
     far = f"to {high:.4g} m" if np.isfinite(high) else "or more, to infinity"
     lines = [("95 % range", f"{low:.4g} m {far}, from the middle of the stations")]

@@ -19,7 +19,8 @@ from optloc.bounds.rank import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.explanations import Explanation
-from optloc.problem.fix import Active, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Active
 from optloc.show.knowledge import is_shown
 
 Columns = dict[str, Array]
@@ -56,6 +57,16 @@ def records(columns: Columns) -> list[dict[str, Any]]:
     """Return a table as a list of dictionaries in JSON types, one for each row."""
     lists = {name: plain(values) for name, values in columns.items()}
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+
+
+def with_level_sigmas(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a row with `sigma_east`, `sigma_north` and `sigma_up`, m, if it is on Earth.
+
+    A standard deviation without a covariance is None.
+    """
+    found = {name: record[f"cov_{2 * axis}"] for axis, name in _LEVEL.items() if f"cov_{2 * axis}" in record}
+    # A constraint that holds a coordinate can leave a negative rounding error as its variance.
+    return record | {f"sigma_{name}": None if v is None else max(v, 0.0) ** 0.5 for name, v in found.items()}
 
 
 def join_tables(parts: Sequence[Columns]) -> Columns:
@@ -390,7 +401,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
     others = fix.alternatives
     shown = np.isfinite(others.gap)
     return {
-        "sentence": Status(int(fix.code)).sentence,
+        "sentence": fix.sentence,
         "findings": [one.label for one in fix.findings],
         "unchecked": bool(fix.unchecked),
         "gap_to_infinity": None if fix.infinity is None else fix.infinity,
@@ -403,6 +414,7 @@ def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool 
         "explanations": [asdict(explanation) for explanation in explanations_of(fix)],
         "weights": fix.weights if reweighted else None,
         "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
+        "multipliers": [a.multiplier for a in active_of(fix)],
         "certificate": asdict(fix.certificate),
         "biases": bias_records(fix, seen),
         "not_separable": [] if seen is None else list(seen.sentences),

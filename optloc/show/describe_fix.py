@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.base.types import NOTES, Status
+from optloc.base.types import Status
 from optloc.bounds.rank import Observability
 from optloc.problem.fix import Fix
 from optloc.show.answer_sheets import (
@@ -21,28 +21,24 @@ from optloc.show.answer_sheets import (
     suspect_sheet,
 )
 from optloc.show.answer_texts import (
-    NOT_DETERMINED,
     chi_square_text,
     constraint_text,
     epoch_error_rows,
     extent_rows,
     frame_rows,
-    motion_rows,
     origin_rows,
-    place_rows,
     region_rows,
-    sure_rows,
 )
-from optloc.show.columns import RESCALED, ROBUST, TAILS, UNCHECKED, Columns, active_of, fix_columns
-from optloc.show.fix_answer import AnswerSection, FixAnswer, FixSheet, Row, Section, Verdict, verdict_of
+from optloc.show.columns import UNCHECKED, Columns, active_of, fix_columns
+from optloc.show.fix_answer import AnswerSection, FixAnswer, FixSheet, Row, Verdict, status_named
 from optloc.show.knowledge import has_place, known_rows
+from optloc.show.row_answer import row_answer, row_verdict, use_rows, why_rows
 
 if TYPE_CHECKING:
     from optloc.model_checks.geometry import Advice
 
 # Reasons that are printed for a batch: a screen shows them. The remaining ones are counted.
 _REASONS = 10
-_NO_POSITION = "none"
 
 
 def answer_of(
@@ -80,20 +76,16 @@ def answer_of(
     """
     columns = fix_columns(fix) if columns is None else columns
     if fix.shape:
-        sections = _batch_sections(fix, columns, details, most)
+        by = [str(name) for name in fix.label_names if name is not None]
+        sheet = state_sheet(columns, f"Fixes by {', '.join(by)}" if by else "Fixes", most)
+        sections = _batch_sections(fix, columns, details, sheet)
         return FixAnswer(title, _batch_verdict(fix), sections, tuple(advice))
     if not title and fix.labels is not None:
         title = f"fix {fix.labels[()]}"
-    verdict = Status(int(fix.code))
-    careful = "care" if fix.unchecked and verdict is Status.OK else verdict_of(verdict)
-    found = [
-        AnswerSection("use", _use_rows(fix)),
-        _where(fix, columns, where, most),
-        AnswerSection("how sure", _sure_rows(fix, columns)),
-        AnswerSection("why not", _why_rows(fix)),
-        _details(fix, columns, seen, unit_of, details),
-    ]
-    return FixAnswer(title, careful, _present(found), tuple(advice))
+    several = len(columns["x"]) > 1
+    main = _states(columns, fix, where, most) if several else row_answer(columns, 0, fix, where=where).sections
+    found = [*main, _details(fix, columns, seen, unit_of, details)]
+    return FixAnswer(title, row_verdict(columns, 0), _present(found), tuple(advice))
 
 
 def _present(sections: Sequence[AnswerSection]) -> tuple[AnswerSection, ...]:
@@ -104,46 +96,21 @@ def _present(sections: Sequence[AnswerSection]) -> tuple[AnswerSection, ...]:
 # One fix.
 
 
-def _use_rows(fix: Fix) -> tuple[Row, ...]:
-    """Return the rows of the first section: the status with its notes, and the sentence of the status."""
-    verdict = Status(int(fix.code))
-    noted = {Status.TAILS: TAILS, Status.ROBUST: ROBUST, Status.RESCALED: RESCALED}
-    notes = [UNCHECKED] * bool(fix.unchecked) + [words for note, words in noted.items() if fix.has(note)]
-    return ("status", "; ".join([verdict.label, *notes])), ("", verdict.sentence)
-
-
-def _where(fix: Fix, columns: Columns, more: Sequence[Row], most: int) -> AnswerSection:
-    """Return the second section: the position of a fix with one state, or the table of several states."""
-    name: Section = "where"
-    if len(columns["x"]) > 1:
-        sheet = state_sheet(columns, "", most)
-        # The states of one fix share its status, which is in the first row of the answer.
-        kept = [j for j, head in enumerate(sheet.head) if head != "status"]
-        rows = [tuple(row[j] for j in kept) for row in sheet.rows]
-        return AnswerSection(name, tuple(more), (FixSheet("States", tuple(sheet.head[j] for j in kept), rows),))
-    rows_of_place = place_rows(columns, 0)
-    if not rows_of_place:
-        missing = NOT_DETERMINED if known_rows(fix) else _NO_POSITION
-        return AnswerSection(name, (("position", missing), *more))
-    return AnswerSection(name, (*rows_of_place, *motion_rows(columns, 0), *origin_rows(columns, 0), *more))
-
-
-def _sure_rows(fix: Fix, columns: Columns) -> tuple[Row, ...]:
-    """Return the rows of the third section: standard deviations, the 95 % radius, and valid intervals.
-
-    Without a valid position, the section has the directions and ranges that the data determine.
-    """
+def _states(columns: Columns, fix: Fix, where: Sequence[Row], most: int) -> list[AnswerSection]:
+    """Return the sections of one fix with several states: its status, and the table of its states."""
+    sheet = state_sheet(columns, "", most)
+    # The states of one fix share its status, which is in the first row of the answer.
+    kept = [j for j, head in enumerate(sheet.head) if head != "status"]
+    rows = [tuple(row[j] for j in kept) for row in sheet.rows]
+    table = FixSheet("States", tuple(sheet.head[j] for j in kept), rows)
     known = known_rows(fix)
-    spread = sure_rows(columns, 0) if len(columns["x"]) == 1 else []
-    return (*spread, *(known if known and not has_place(fix) else [*extent_rows(fix), *known]))
-
-
-def _why_rows(fix: Fix) -> tuple[Row, ...]:
-    """Return the rows of the fourth section: the reason of the status, and other findings."""
-    verdict, reason = Status(int(fix.code)), str(fix.reason[()] or "")
-    others = [one.label for one in fix.findings if one is not verdict and one not in NOTES]
-    rows = [("reason", reason)] if reason else []
-    return (*rows, ("also found", ", ".join(others))) if others else tuple(rows)
+    intervals = [] if known and not has_place(fix) else extent_rows(fix)
+    return [
+        AnswerSection("use", use_rows(columns, 0, fix.sentence)),
+        AnswerSection("where", tuple(where), (table,)),
+        AnswerSection("how sure", (*intervals, *known)),
+        AnswerSection("why not", why_rows(columns, 0)),
+    ]
 
 
 def _details(
@@ -179,8 +146,8 @@ def _batch_verdict(fix: Fix) -> Verdict:
     return "good" if bool((fix.code == Status.OK).all()) and not bool(np.any(fix.unchecked)) else "care"
 
 
-def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], most: int) -> tuple[AnswerSection, ...]:
-    """Return the sections of a batch: counts in words, the table of fixes, counts by status, and reasons."""
+def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], sheet: FixSheet) -> tuple[AnswerSection, ...]:
+    """Return the sections of a batch: counts in words, the table of fixes `sheet`, counts by status, and reasons."""
     if not fix.code.size:
         return (AnswerSection("use", (("status", "0 fixes"),)),)
     alone = int(np.asarray(columns["unchecked"], dtype=bool).sum())
@@ -189,12 +156,12 @@ def _batch_sections(fix: Fix, columns: Columns, details: Sequence[Row], most: in
     use: list[Row] = [("status", status_words(columns, notes))]
     use += [("", Status.OK.sentence)] if set(labels) == {Status.OK.label} else []
     refused = [label for label, _ in labels.most_common() if label != Status.OK.label]
-    why: list[Row] = [(label, Status[label.upper().replace(" ", "_")].sentence) for label in refused]
+    why: list[Row] = [(label, one.sentence) for label in refused if (one := status_named(label)) is not None]
     rows = tuple(details)
     return _present(
         [
             AnswerSection("use", tuple(use)),
-            AnswerSection("where", (), (state_sheet(columns, "Fixes", most), count_sheet(columns))),
+            AnswerSection("where", (), (sheet, count_sheet(columns))),
             AnswerSection("why not", (*why, *_reason_rows(columns))),
             AnswerSection("details", rows),
         ]

@@ -16,7 +16,7 @@ from optloc.model_checks.geometry import Advice
 SECTIONS = ("use", "where", "how sure", "why not", "details")
 """Names of the sections in the order in which every output prints them."""
 
-TEXT_COLUMNS = {"fix", "epoch", "target", "status", "name", "member", "estimate", "suspect"}
+TEXT_COLUMNS = {"fix", "emitter", "epoch", "target", "status", "name", "member", "estimate", "suspect", "method"}
 """Columns of words, which are aligned to the left; columns of numbers are aligned to the right."""
 
 Section = Literal["use", "where", "how sure", "why not", "details"]
@@ -124,6 +124,26 @@ def verdict_of(status: Status) -> Verdict:
     if status is Status.OK:
         return "good"
     return "care" if status in ANSWERED and status is not Status.MISFIT else "bad"
+
+
+def verdict_of_label(label: str) -> Verdict:
+    """Return whether to use a row of a table: like its status; the first state of a track like a good fix."""
+    status = status_named(label)
+    if status is None:
+        return "good" if label in _GOOD_EVENTS else "care"
+    return verdict_of(status)
+
+
+# Labels of scans of a track that are no status of a fix, and need no care.
+_GOOD_EVENTS = {"started", "starting"}
+
+
+def status_named(label: str) -> Status | None:
+    """Return the status with a label, such as "too few rows"; None for other texts, such as the events of a track."""
+    return _BY_LABEL.get(label)
+
+
+_BY_LABEL = {status.label: status for status in Status}
 
 
 def advice_lines(advice: Sequence[Advice]) -> list[str]:

@@ -10,7 +10,7 @@ from optloc.model_checks.determine import determined, of_fix
 from optloc.problem.determined import Determined
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.show.columns import fix_columns, fix_detail, plain, records
+from optloc.show.columns import fix_columns, fix_detail, plain, records, with_level_sigmas
 from optloc.show.describe_fix import answer_of
 from optloc.show.render import html_of_answer, text_of_answer
 
@@ -58,7 +58,7 @@ def dict_of(fix: Fix) -> dict[str, Any]:
     if fix.shape:
         flat = fix.flat()
         return {"fixes": [dict_of(flat[i]) for i in range(len(flat))]}
-    rows = records(fix_columns(fix))
+    rows = [with_level_sigmas(row) for row in records(fix_columns(fix))]
     detail: dict[str, Any] = plain(fix_detail(fix))
     return in_order_of_answer(rows[0] | detail if len(rows) == 1 else {"states": rows} | detail)
 
@@ -92,7 +92,10 @@ def frame_of(fix: Fix) -> Any:
     # A run has several rows for each fix, so its labels cannot be an index.
     if fix.labels is None or fix.labels.size != len(table):
         return table
-    return table.drop(columns="label").set_index(pd.Index(fix.labels.ravel().tolist()))
+    index = pd.Index(fix.labels.ravel().tolist())
+    if len(fix.label_names) == index.nlevels:
+        index.names = list(fix.label_names)
+    return table.drop(columns="label").set_index(index)
 
 
 def geojson_of(fix: Fix, problem: Problem | None = None) -> dict[str, Any]:

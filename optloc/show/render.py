@@ -26,6 +26,26 @@ def text_of_answer(answer: FixAnswer) -> str:
     return "\n".join(lines)
 
 
+def line_of_answer(answer: FixAnswer) -> str:
+    """Return an answer as one line, for descriptions of marks: the rows of each section, without tables.
+
+    The texts are not escaped: each format escapes them in its own way.
+    """
+    parts = []
+    for section in answer.sections:
+        texts = [text for _, text in section.rows]
+        if section.name == "use":
+            parts += [_stopped(text) for text in texts]
+        elif texts:
+            parts.append(_stopped("; ".join(f"{label}: {text}" for label, text in section.rows)))
+    return " ".join(parts)
+
+
+def _stopped(text: str) -> str:
+    """Return a text with a full stop at its end."""
+    return text if text.endswith(".") else f"{text}."
+
+
 def sheet_lines(sheet: FixSheet) -> Iterable[str]:
     """Yield the lines of a sheet: each column is as wide as its longest cell, and the last column is wrapped."""
     if sheet.title:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from math import nan
 from typing import TYPE_CHECKING
 
+from optloc.base.short_form import HasShortForm
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -63,8 +65,8 @@ class TextTable:
         return float(found[part]) if part < len(found) else nan
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+@dataclass(frozen=True, slots=True, repr=False)
+class Sheet(HasShortForm):
     """A table in two forms: numbers and text.
 
     Parameters

@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.short_form import ShortForm
 from optloc.base.types import Array, Status
 from optloc.show.answer_texts import finite, with_sigma
+from optloc.show.describe_emitters import answer_of_emitters
 from optloc.show.fix_answer import FixSheet, Row
 from optloc.show.render import html_of_sheet, sheet_lines
 
@@ -18,13 +19,16 @@ if TYPE_CHECKING:
     from optloc.base.frames import Frame
     from optloc.multi_target.answer import Emitters
     from optloc.problem.problem import Problem
+    from optloc.show.sheet import Sheet
     from optloc.solvers.posing.posed import Posed
     from optloc.solvers.prepared import Prepared
     from optloc.tracking.track import Track
     from optloc.uncertainty.region import Region
 
 # A short form has at most 15 lines and 1 000 characters: at most 12 rows of about 80 characters.
-_ROWS, _LABEL, _LONGEST = 12, 20, 64
+_ROWS, _LABEL, _LONGEST, _TITLE = 12, 32, 64, 100
+# The sentence of a status, in a row without a label, is never cut: it has the advice at its end.
+_SENTENCE = 200
 # Names in one line; further names are counted.
 _NAMES = 4
 
@@ -41,8 +45,8 @@ def html_of_form(form: ShortForm) -> str:
 
 def _sheet(form: ShortForm) -> FixSheet:
     """Return a short form as a sheet, with long texts cut."""
-    rows = [(_cut(label, _LABEL), _cut(text)) for label, text in form.rows[:_ROWS]]
-    return FixSheet(_cut(form.title), (), [*rows, *([("next", form.following)] if form.following else [])])
+    rows = [(_cut(label, _LABEL), _cut(text, _LONGEST if label else _SENTENCE)) for label, text in form.rows[:_ROWS]]
+    return FixSheet(_cut(form.title, _TITLE), (), [*rows, *([("next", form.following)] if form.following else [])])
 
 
 def _cut(text: str, most: int = _LONGEST) -> str:
@@ -163,13 +167,24 @@ def _prepared(prepared: Prepared) -> ShortForm:
 
 def _emitters(emitters: Emitters) -> ShortForm:
     """Return the short form of separated emitters: status, positions, and rows without an emitter."""
-    rows: list[Row] = [("status", emitters.status.label), ("", emitters.status.sentence)]
-    rows += [("reason", emitters.reason)] if emitters.reason else []
-    for i, fix in enumerate(emitters.fixes[:_NAMES]):
-        place = ", ".join(f"{value:.1f}" for value in fix.position)
-        rows.append((f"emitter {i + 1}", f"{place} m from {len(emitters.rows(i))} rows; {fix.status.label}"))
-    rows.append(("false rows", str(int((emitters.assignment < 0).sum()))))
-    return ShortForm(f"{emitters.count} emitters", tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
+    answer = answer_of_emitters(emitters)
+    rows = [*answer.section("use").rows, *answer.section("why not").rows[:2]]
+    for sheet in answer.section("where").sheets:
+        # The last column is the status, and each row begins with the number of the emitter.
+        names = sheet.head[1:-3]
+        for row in sheet.rows[:_NAMES]:
+            place = ", ".join(f"{name.removesuffix(', m')} {cell}" for name, cell in zip(names, row[1:-3], strict=True))
+            rows.append((f"emitter {row[0]}", f"{place}; {row[-1]}"))
+    title = f"{emitters.count} emitter{'s' if emitters.count != 1 else ''}"
+    return ShortForm(title, tuple(rows), "emitters.fixes, emitters.assignment, emitters.ghosts")
+
+
+def _table(table: Sheet) -> ShortForm:
+    """Return the short form of a table of a report: its columns and its first rows."""
+    shown = table.shown
+    rows: list[Row] = [("columns", listed(shown.header, 12)), ("rows", str(len(shown.rows)))]
+    rows += [(cells[0], ", ".join(cells[1:])) for cells in shown.rows[:_NAMES]]
+    return ShortForm(f"Table: {shown.title}", tuple(rows), "sheet.frame, sheet.shown.markdown()")
 
 
 FORMS: dict[str, Callable[[Any], ShortForm]] = {
@@ -179,5 +194,6 @@ FORMS: dict[str, Callable[[Any], ShortForm]] = {
     "Posed": _posed,
     "Prepared": _prepared,
     "Emitters": _emitters,
+    "Sheet": _table,
 }
 """Short forms of the values of the core, by the name of the class."""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         polynomial as polynomial,
         singer as singer,
     )
-    from optloc.tracking.entry import Entry as Entry, Rules as Rules
+    from optloc.tracking.entry import Entry as Entry, Rules as Rules, scan_sentence as scan_sentence
     from optloc.tracking.measurement_space import lines as lines, simplified as simplified
     from optloc.tracking.named_models import (
         MOTIONS as MOTIONS,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -84,3 +85,33 @@ class Entry:
     def label(self) -> str:
         """Return the event, or the status if there is no event or if a start is not ok."""
         return self.event if self.event and self.code == Status.OK else self.code.label
+
+
+# The label of a scan has another meaning than the status of a fix: the state also contains the scans before it.
+_SENTENCES: Mapping[str, str] = {
+    Status.OK.label: "Use it: the rows of the scan agree with the predicted state, and its covariance is valid.",
+    "starting": "There is no state yet: this scan is a part of the start of the track.",
+    "started": "Use it: the state is the fix of this scan and of the scans before it.",
+    "restarted": "Use it: the state is a new fix of the last scans. The track before it was lost.",
+    "lost": "There is no state: the track has ended, and the next scans start a new track.",
+    Status.TOO_FEW_ROWS.label: "Use it with its larger covariance: the scan has no valid row, so the state is only "
+    "predicted.",
+    Status.REJECTED.label: "Most rows of the scan did not pass the gate or are not finite; check the outliers, and try "
+    "a robust loss.",
+    Status.MISFIT.label: "Do not use it: the innovations are larger than the stated noise allows; check sigma, the "
+    "process noise and the motion model.",
+    Status.UNBOUNDED.label: "Do not use it: the position is too uncertain to follow, so the track ends; add stations "
+    "or measurements.",
+    Status.AMBIGUOUS.label: "Several states of the start fit the scans about equally well; wait for more scans, or "
+    "give a start.",
+    Status.NUMERICAL.label: "The update failed, so the state is only predicted; the reason names the cause.",
+    Status.CURVED.label: "The state of the start is right, but its covariance is not valid; wait for more scans.",
+}
+
+
+def scan_sentence(label: str) -> str:
+    """Return the sentence of the label of a scan (`Entry.label`): whether to use its state, and what helps.
+
+    A label that has the same meaning as the status of a fix has the sentence of the status.
+    """
+    return _SENTENCES.get(label) or Status[label.upper().replace(" ", "_")].sentence

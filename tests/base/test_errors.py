@@ -38,6 +38,11 @@ def test_no_solution_of_a_batch_names_each_status_once():
     assert text == f"{Status.STALLED.sentence} {Status.AMBIGUOUS.sentence}"
 
 
+def test_no_solution_of_one_fix_has_the_sentence_of_the_fix():
+    fix = SimpleNamespace(status=Status.UNPROVEN, shape=(), sentence="Use the method 'auto'.")
+    assert str(NoSolution("problem", fix)) == "Use the method 'auto'."
+
+
 def test_no_solution_without_a_fix():
     assert str(NoSolution(None, None)) == "There is no fix."
 

@@ -52,6 +52,6 @@ def test_the_answer_of_a_file_has_the_names_of_its_events(tmp_path, found):
     (tmp_path / "events.toml").write_text(EVENTS)
     events = fix_file(read(tmp_path / "events.toml"), "auto", quiet=True)
     table = answer_of_file(events).section("where").sheets[0]
-    assert table.head == ("epoch", "x, m", "y, m", "sigma, m", "status")
+    assert table.head == ("epoch", "x, m", "y, m", "status")
     assert [row[0] for row in table.rows] == ["morning", "evening"]
     assert answer_of_file(events).section("use").rows[0] == ("status", "2 fixes: all ok")

@@ -6,10 +6,25 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
 from optloc import InvalidProblem
-from optloc.cli.output import Screen, claim_outputs, dumps, is_csv, meter, say_all, show_sheet, write_table, write_text
+from optloc.cli import app
+from optloc.cli.output import (
+    Screen,
+    claim_outputs,
+    dumps,
+    is_csv,
+    meter,
+    say_all,
+    show_sheet,
+    uses_standard_output,
+    write_table,
+    write_text,
+)
 from optloc.show.fix_answer import FixSheet
+
+RUN = CliRunner()
 
 
 def test_json_is_strict():
@@ -54,10 +69,41 @@ def test_outputs_of_unknown_type_are_refused(given, words, tmp_path):
     claim_outputs(table=tmp_path / "t.csv", picture=tmp_path / "p.svg")
 
 
+@pytest.mark.parametrize(
+    "command", [["fix", "demo"], ["track", "run"], pytest.param(["check", "run"], marks=pytest.mark.slow)]
+)
+def test_results_on_standard_output_are_the_table_alone(command, tmp_path):
+    stored = tmp_path / "results.csv"
+    wanted = RUN.invoke(app, [*command, "--out", str(stored)])
+    found = RUN.invoke(app, [*command, "--out", "-"])
+    assert found.exit_code == wanted.exit_code
+    assert found.stdout_bytes == stored.read_bytes()
+    assert found.stderr.splitlines()[0] == wanted.stdout.splitlines()[0]  # the text for people
+
+
+def test_one_output_has_standard_output():
+    assert not uses_standard_output(None, Path("a.csv"), as_json=True)
+    assert uses_standard_output(Path("-"), None)
+    with pytest.raises(InvalidProblem, match="name a file"):
+        uses_standard_output(Path("-"), Path("-"))
+    with pytest.raises(InvalidProblem, match="name a file"):
+        uses_standard_output(Path("-"), as_json=True)
+    with pytest.raises(InvalidProblem, match=r"a picture is no text.*\.png"):
+        claim_outputs(picture=Path("-"))
+
+
 def test_a_minus_is_standard_output(tmp_path, capsys):
     write_text(Path("-"), "a line")
     write_text(tmp_path / "a.txt", "a line")
     assert capsys.readouterr().out == (tmp_path / "a.txt").read_text() == "a line\n"
+
+
+def test_a_notebook_has_no_bars_although_its_commands_see_a_terminal(monkeypatch):
+    monkeypatch.delenv("JPY_PARENT_PID", raising=False)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    assert Screen(stderr=True).shows_bars
+    monkeypatch.setenv("JPY_PARENT_PID", "1")
+    assert not Screen(stderr=True).shows_bars
 
 
 def test_a_quiet_meter_prints_nothing(capsys):

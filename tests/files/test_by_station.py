@@ -65,5 +65,5 @@ def test_integers_of_a_long_frame_are_the_values_of_the_table(word):
 def test_rows_of_a_long_frame_are_grouped_by_any_word_for_a_message():
     frame = pd.DataFrame({"event": ["e2", "e2", "e1", "e1"], "station": ["A", "B"] * 2, "range": [1.0, 2.0, 3.0, 4.0]})
     found = station_values("ranges", frame, NAMES, None)
-    assert found.labels == ["e2", "e1"]
+    assert found.labels == (["e2", "e1"], ("event",))
     assert found.values.tolist() == [[1.0, 2.0], [3.0, 4.0]]

@@ -86,6 +86,17 @@ def test_loading_is_no_compilation_and_quiet_is_quiet(code, line):
     assert done.stderr == line
 
 
+def test_a_cell_of_a_notebook_stores_no_progress():
+    """Jupyter sets the variable for its kernels, and shell commands of a cell inherit it."""
+    code = SLEEPS + "run(False, 2.4)"
+    environment = ENVIRONMENT | {"JPY_PARENT_PID": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    shown = "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n" + code
+    done = subprocess.run([sys.executable, "-c", shown], env=environment, capture_output=True, text=True, check=True)
+    assert "loading machine code\n" in done.stderr
+
+
 def test_the_option_quiet_switches_progress_off_and_its_absence_on():
     from typer.testing import CliRunner
 

@@ -8,8 +8,9 @@ from cases import CASES
 
 from optloc import simulate, solve
 from optloc.base.records import join, overwrite, take
+from optloc.base.types import Status
 from optloc.problem import Certificate
-from optloc.problem.claims import claim, empty_claims, merged_claims, repeated_claims
+from optloc.problem.claims import claim, empty_claims, merged_claims, repeated_claims, sentence_of
 
 GIVEN = [
     Certificate("global", "proven best", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
@@ -67,3 +68,19 @@ def test_certificates_are_told_once():
     assert not fix.certificate.flags.writeable
     assert fix[2:5].certificate[1] == fix.certificate[3]
     assert copy.deepcopy(fix).certificate.tolist() == fix.certificate.tolist()
+
+
+@pytest.mark.parametrize(
+    ("certificate", "advice", "absent"),
+    [
+        (Certificate("local", "the best of all candidates", "refinement"), "method 'auto'", "measurements"),
+        (Certificate("unknown", "the rays bend", "branch and bound"), "no proof covers", "method 'auto'"),
+        (Certificate("unknown", "not finished", "branch and bound", boxes=9), "add measurements", "method 'auto'"),
+        (Certificate("global", "proven best", "branch and bound", boxes=9), "add measurements", "method 'auto'"),
+    ],
+)
+def test_the_advice_for_an_unproven_fix_is_a_step_that_was_not_taken(certificate, advice, absent):
+    sentence = sentence_of(Status.UNPROVEN, claim(certificate))
+    assert advice in sentence
+    assert absent not in sentence
+    assert sentence_of(Status.CURVED, claim(certificate)) == Status.CURVED.sentence

@@ -29,6 +29,19 @@ def with_scales():
     return with_bias(ranging(), "scale", form="scale", per="station", sigma=0.1)
 
 
+def two_targets(*motions):
+    rows = measured("range", np.full(8, 700.0), a=np.tile(np.arange(4), 2), sigma=1.0, target=np.repeat([0, 1], 4))
+    return assemble(STATIONS, rows, motions=motions).flat()
+
+
+def beacon_and_emitter():
+    return two_targets(Motion(known=np.array([[[500.0, 400.0]]])), Motion())
+
+
+def two_emitters():
+    return two_targets(Motion(), Motion())
+
+
 def two_planes():
     fixed = constraints.box([10.0, 20.0], [10.0, 20.0])
     return ranging(constraints=fixed)
@@ -42,6 +55,8 @@ def two_planes():
         (in_space, "the target moves in space"),
         (with_scales, f"there are several scales (4), but the proof covers {MOST_FACTORS}"),
         (two_planes, "the equalities leave no free direction"),
+        (two_emitters, "there are 2 targets, but the proof covers one"),
+        (beacon_and_emitter, "rows of a target with a known position share biases"),
     ],
 )
 def test_what_is_beyond_the_proof_is_named(make, words):

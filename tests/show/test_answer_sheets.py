@@ -16,11 +16,12 @@ from optloc.show.answer_sheets import (
     suspect_sheet,
 )
 from optloc.show.columns import fix_columns
+from optloc.show.describe_fix import answer_of
 
 
 def test_a_long_table_has_the_labels_of_its_first_and_last_rows():
     sheet = state_sheet(fix_columns(batch()), "Fixes")
-    assert sheet.head == ("fix", "latitude", "longitude", "height, m", "sigma, m", "status")
+    assert sheet.head == ("fix", "latitude", "longitude", "height, m", "sigma east, north, m", "status")
     names = [row[0] for row in sheet.rows]
     half = MOST_ROWS // 2
     assert names == [
@@ -30,7 +31,9 @@ def test_a_long_table_has_the_labels_of_its_first_and_last_rows():
     ]
     assert sheet.rows[0][1:] == ("-", "-", "-", "-", "unbounded")
     _, fix = ranged()
-    assert sheet.rows[1][1] == f"{fix.latlon[0]:.6f}"
+    single = {label: text for name in ("where", "how sure") for label, text in answer_of(fix).section(name).rows}
+    assert f"{sheet.rows[1][1]} deg" == single["latitude"]
+    assert f"{sheet.rows[1][4]} m" == single["sigma east, north"]
     assert sheet.rows[1][-1] == "ok"
 
 
@@ -42,8 +45,20 @@ def test_targets_and_plain_coordinates_are_named():
     assert state_sheet(fix_columns(states()), "").head[0] == "target"
     plain = fix_columns(join([singles()["ok in a plain frame"].flat()] * 2, 2))
     sheet = state_sheet(plain, "")
-    assert sheet.head == ("fix", "x, m", "y, m", "sigma, m", "status")
+    assert sheet.head == ("fix", "x, m", "y, m", "status")
     assert [row[0] for row in sheet.rows] == ["0", "1"]
+    single = dict(answer_of(singles()["ok in a plain frame"]).section("where").rows)
+    assert [f"{cell} m" for cell in sheet.rows[0][1:3]] == [single["x"], single["y"]]
+
+
+def test_a_table_that_is_too_wide_has_the_sigmas_in_one_column(monkeypatch):
+    monkeypatch.setattr("optloc.show.answer_sheets._WIDEST", 20)
+    fix = singles()["ok in a plain frame"]
+    sheet = state_sheet(fix_columns(fix), "")
+    assert sheet.head == ("x, m", "y, m", "sigma x, y, m", "status")
+    single = {label: text for name in ("where", "how sure") for label, text in answer_of(fix).section(name).rows}
+    assert single["x"].startswith(f"{sheet.rows[0][0]} ± ")
+    assert f"{sheet.rows[0][2]} m" == single["sigma x, y"]
 
 
 def test_many_fixes_are_counted_by_status():

@@ -1,6 +1,9 @@
 """The methods of a fix: text, HTML, dictionaries, data frames and maps, with the labels of the user."""
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 from show.answers import batch
 from show.ranging import ranged
@@ -54,3 +57,31 @@ def test_keys_have_the_order_of_the_sections():
     wanted = ["label", "status", "sentence", "lat_deg", "x", "sigma_x", "reason", "certificate"]
     assert [key for key in record if key in wanted] == wanted
     assert in_order_of_answer({"cost": 1, "status": 2}) == {"status": 2, "cost": 1}
+
+
+@pytest.mark.parametrize("names", [("burst",), ("day", "burst"), (None,)])
+def test_a_data_frame_keeps_the_names_of_the_index(names):
+    places = {"A": (0.0, 0.0), "B": (1000.0, 0.0), "C": (0.0, 1000.0), "D": (900.0, 1100.0)}
+    ranges = np.linalg.norm(np.array([[300.0, 400.0], [310.0, 400.0]])[:, None] - [*places.values()], axis=-1)
+    labels = [("mon", 7), ("tue", 9)] if len(names) == 2 else [7, 9]
+    index = pd.MultiIndex.from_tuples(labels, names=names) if len(names) == 2 else pd.Index(labels, name=names[0])
+    fix = optloc.locate(places, ranges=pd.DataFrame(ranges, columns=list(places), index=index), sigma=1.0)
+    assert fix.to_dataframe().index.equals(index)
+    assert tuple(fix.to_dataframe().index.names) == names
+    assert fix.flat().label_names == fix[:1].label_names == names
+    title = f"Fixes by {', '.join(names)}" if names[0] else "Fixes"
+    assert title in str(fix).splitlines()
+    assert f"<caption>{title}</caption>" in fix._repr_html_()
+
+
+def test_a_dictionary_has_numbers_of_multipliers_and_sigmas_along_east_and_north():
+    problem, fix = ranged()
+    found = dict_of(fix)
+    axes = problem.frame.enu_axes(fix.position)[:2]
+    sigma = np.sqrt(np.diagonal(axes @ fix.covariance() @ axes.T))
+    assert [found["sigma_east"], found["sigma_north"]] == pytest.approx(sigma.tolist())
+    assert "sigma_up" not in found
+    held = optloc.solve(replace(problem, constraints=(*optloc.constraints.box([-np.inf, -np.inf], [290.0, np.inf]),)))
+    (one,) = held.active[()]
+    assert dict_of(held)["multipliers"] == [one.multiplier]
+    assert one.multiplier > 0.0

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from optloc.cli import (
     STOPPED,
@@ -27,9 +26,11 @@ from optloc.cli import (
     complete,
     example,
     find_problem,
+    show_sheet,
 )
 from optloc.files import claim
 from optloc.problem import InvalidProblem
+from optloc.show import FixSheet
 
 # Heavy libraries are imported inside the commands, so that --help replies at once.
 
@@ -156,7 +157,7 @@ def report(
     from optloc.lab.report.study_page import write_report
 
     console = Screen(stderr=True)
-    shown = console.is_terminal and not quiet
+    shown = console.shows_bars and not quiet
     with console.status("report") if shown else nullcontext() as status:
         files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
     if not quiet:
@@ -406,7 +407,7 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
     console = Screen(stderr=True)
     counts: Counter[str] = Counter()
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    shown = console.is_terminal and not quiet
+    shown = console.shows_bars and not quiet
     with Progress(*parts, TextColumn("{task.fields[counts]}"), console=console, disable=not shown) as progress:
         task = progress.add_task(title, total=total, counts="")
 
@@ -430,16 +431,31 @@ def _show(progress: Any, console: Console) -> None:
     state = "complete" if progress.complete else f"{progress.done} of {progress.chunks} chunks"
     line = f"{manifest.title or manifest.name}: {state}, {progress.rows} of {manifest.rows} rows"
     console.print(line, style="bold", highlight=False, markup=False, soft_wrap=True)
-    table = Table("method")
-    statuses = [status for status, _ in Counter(progress.counts).most_common()]
-    for name in statuses:
-        table.add_column(name, justify="right")
-    for method in dict.fromkeys(method for method, _ in progress.methods):
-        table.add_row(method, *(str(progress.methods.get((method, name), 0)) for name in statuses))
-    console.print(table)
+    show_sheet(_status_sheet(progress, console.width), console)
     for (method, name), reason in progress.failures.items():
         line = f"{method}: {name} in {progress.methods[method, name]} trials, for example: {reason}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _status_sheet(progress: Any, width: int) -> FixSheet:
+    """Return the table of statuses by method.
+
+    Each status is a column if the table fits in `width` characters; otherwise each status of a method is a row.
+    """
+    statuses = [status for status, _ in Counter(progress.counts).most_common()]
+    methods = list(dict.fromkeys(method for method, _ in progress.methods))
+    # A column is as wide as the longest word of its heading, with two blanks and a line.
+    words = [max(map(len, name.split())) for name in statuses]
+    if max(map(len, methods), default=0) + 4 + sum(word + 3 for word in words) <= width:
+        cells = [(name, *(str(progress.methods.get((name, one), 0)) for one in statuses)) for name in methods]
+        return FixSheet("", ("method", *statuses), cells)
+    rows: list[tuple[str, ...]] = []
+    ends = []
+    for name in methods:
+        found = [(one, progress.methods[name, one]) for one in statuses if (name, one) in progress.methods]
+        rows += [(name if i == 0 else "", one, str(count)) for i, (one, count) in enumerate(found)]
+        ends.append(len(rows) - 1)
+    return FixSheet("", ("method", "status", "trials"), rows, tuple(ends))
 
 
 def _show_comparison(differences: list[Any], one: Path, two: Path, console: Console) -> None:
@@ -449,9 +465,7 @@ def _show_comparison(differences: list[Any], one: Path, two: Path, console: Cons
         scenario, sweep, noise = case
         title = " ".join([scenario, *([] if sweep == "{}" else [sweep]), noise])
         console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
-        table = Table("method")
-        for name in ("answers A", "B, %", "z", "RMSE A", "B, m", "time B/A", "values"):
-            table.add_column(name, justify="right", no_wrap=True)
+        rows = []
         for difference in group:
             values = "identical" if difference.identical else "same data" if difference.same_data else "other data"
             times = difference.two.seconds / difference.one.seconds if difference.one.seconds else nan
@@ -463,8 +477,9 @@ def _show_comparison(differences: list[Any], one: Path, two: Path, console: Cons
                 difference.two.rmse,
                 times,
             )
-            table.add_row(difference.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values)
-        console.print(table)
+            rows.append((difference.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values))
+        heads = ("answers A, %", "answers B, %", "z", "RMSE A, m", "RMSE B, m", "time B/A", "values")
+        show_sheet(FixSheet("", ("method", *heads), rows), console)
 
 
 def _show_pairs(pairs: list[Any], console: Console) -> None:
@@ -473,14 +488,15 @@ def _show_pairs(pairs: list[Any], console: Console) -> None:
         rows = list(group)
         title = f"{case}, {noise}: against {rows[0].against}"
         console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
-        table = Table("method")
-        for name in ("trials", "only it right", "only other right", "p", "error difference, m", "time ratio"):
-            table.add_column(name, justify="right")
+        heads = ("trials", "only it : only other right", "p", "error difference, m", "time ratio")
+        table = []
         for pair in rows:
-            cells = (f"{median.value:.2g} [{median.low:.2g}, {median.high:.2g}]" for median in (pair.error, pair.time))
-            counts = (str(n) for n in (pair.trials, pair.alone, pair.other_alone))
-            table.add_row(pair.method, *counts, f"{pair.p:.2g}", *cells)
-        console.print(table)
+            # The interval is below the median: side by side, two of them do not fit in 80 characters.
+            medians = (f"{one.value:.2g}\n[{one.low:.2g}, {one.high:.2g}]" for one in (pair.error, pair.time))
+            only = f"{pair.alone} : {pair.other_alone}"
+            table.append((pair.method, str(pair.trials), only, f"{pair.p:.2g}", *medians))
+        show_sheet(FixSheet("", ("method", *heads), table), console)
+    console.print("In brackets: 95 % interval of the median.", highlight=False, markup=False)
 
 
 def _profile_record(profile: Any) -> dict[str, Any]:
@@ -510,29 +526,28 @@ def _show_profiles(profile: Any, console: Console) -> None:
     from optloc.lab.report.sheets import duration, number, percent, solved_within
     from optloc.lab.study.profiles import RATIOS, shares
 
-    table = Table("method")
-    for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):
-        table.add_column(name, justify="right")
     shown = duration if profile.work == "processor" else number
+    rows = []
     for share in shares(profile):
         within = (percent(share.within[ratio]) for ratio in RATIOS)
-        table.add_row(
-            share.method, str(share.trials), percent(share.solved / share.trials), *within, shown(share.median)
-        )
-    console.print(table)
+        solved = percent(share.solved / share.trials)
+        rows.append((share.method, str(share.trials), solved, *within, shown(share.median)))
+    ratios = (f"within {ratio:g} x least, %" for ratio in RATIOS)
+    middle = "median time" if profile.work == "processor" else "median evaluations"
+    show_sheet(FixSheet("", ("method", "trials", "solved, %", *ratios, middle), rows), console)
     console.print(solved_within(profile).shown.note, highlight=False, markup=False, soft_wrap=True)
 
 
 def _show_histories(result: Any, reached: list[Any], tau: float, console: Console) -> None:
     """Print for each method how many trials reach the minimum, and the quartiles of the work."""
     console.print(result.title, style="bold", highlight=False, markup=False, soft_wrap=True)
-    table = Table("method")
-    for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):
-        table.add_column(name, justify="right")
+    rows = []
     for reach in reached:
         counts = (_quartiles(reach.evaluations), _quartiles(reach.iterations))
-        table.add_row(reach.method, str(reach.trials), str(reach.reached), *counts)
-    console.print(table)
+        rows.append((reach.method, str(reach.trials), str(reach.reached), *counts))
+    heads = ("trials", f"trials within {tau:g}", "median evaluations", "median iterations")
+    show_sheet(FixSheet("", ("method", *heads), rows), console)
+    console.print("In brackets: the other two quartiles.", highlight=False, markup=False)
     for remark in result.remarks:
         console.print(f"{remark}.", highlight=False, markup=False, soft_wrap=True)
 

@@ -27,8 +27,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.files import make_folder, replace_together, write_text, written
-from optloc.problem import InvalidProblem
-from optloc.show import ABSENT, Picture, TextTable
+from optloc.show import ABSENT, Picture, TextTable, figure_class
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -220,13 +219,7 @@ class Ink:
 
 def canvas(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches; raise InvalidProblem if matplotlib is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InvalidProblem(
-            "pictures need matplotlib", "reproduce", "install it with: pip install 'optloc[plot]'"
-        ) from None
-    return Figure(figsize=(width, height), layout="constrained")
+    return figure_class()(figsize=(width, height), layout="constrained")
 
 
 def scale(ax: Axes) -> None:

@@ -33,6 +33,7 @@ from optloc.problem import (
     SI_UNIT,
     Array,
     Block,
+    HasShortForm,
     InvalidProblem,
     Noise,
     Problem,
@@ -118,8 +119,8 @@ class Chunk:
         return f"{self.cell.key}-{self.first:09d}-{self.count}"
 
 
-@dataclass(frozen=True)
-class StudyDesign:
+@dataclass(frozen=True, repr=False)
+class StudyDesign(HasShortForm):
     """The experimental design of a study, ready to run.
 
     Parameters

@@ -22,7 +22,7 @@ from optloc.lab.study.baselines import BASELINES
 from optloc.lab.study.design import StudyDesign, design_of_text, machine, versions
 from optloc.lab.study.methods import version_of
 from optloc.lab.study.trial import COLUMNS, FAILED, GAP, TrialPart, arrow_schema
-from optloc.problem import InvalidProblem, Status
+from optloc.problem import HasShortForm, InvalidProblem, Status
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,8 +38,8 @@ _LOCK = ".lock"
 EXPLAINED = (*FAILED, Status.NUMERICAL.label, Status.UNAVAILABLE.label)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyManifest:
+@dataclass(frozen=True, slots=True, repr=False)
+class StudyManifest(HasShortForm):
     """Description of an output folder.
 
     Parameters
@@ -405,8 +405,8 @@ def locked(folder: Path) -> Iterator[None]:
 # Progress of a study.
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+@dataclass(frozen=True, slots=True, repr=False)
+class Progress(HasShortForm):
     """Progress of a study.
 
     Parameters

@@ -29,7 +29,7 @@ from optloc.lab.study.networks import NetworkCase
 from optloc.lab.study.profiles import check_accuracy
 from optloc.lab.study.simulation import Case, DrawnCase, draw
 from optloc.lab.study.summary import case_label, noise_text
-from optloc.problem import Array, InvalidProblem, Problem, by_epoch, nearest, separable
+from optloc.problem import Array, HasShortForm, InvalidProblem, Problem, by_epoch, nearest, separable
 from optloc.solvers import (
     FORMULATIONS,
     SOLVERS,
@@ -75,8 +75,8 @@ class ConvergenceTrace(NamedTuple):
     iterations: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Trials:
+@dataclass(frozen=True, slots=True, repr=False)
+class Trials(HasShortForm):
     """Trials and methods whose histories `histories` computes.
 
     Parameters
@@ -100,8 +100,8 @@ class Trials:
     remarks: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Histories:
+@dataclass(frozen=True, slots=True, repr=False)
+class Histories(HasShortForm):
     """Convergence histories of methods.
 
     Parameters

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optloc.problem import Array, InvalidProblem, nearest
+from optloc.problem import Array, HasShortForm, InvalidProblem, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,8 +34,8 @@ class Median(NamedTuple):
     p: float
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
+@dataclass(frozen=True, slots=True, repr=False)
+class Pair(HasShortForm):
     """Comparison of a method with another method on the same trials.
 
     Parameters

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.lab.study.summary import above_least, instances, performance_profile
-from optloc.problem import Array, InvalidProblem, nearest
+from optloc.problem import Array, HasShortForm, InvalidProblem, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,8 +42,8 @@ _LEAST = 1e-9
 _POINTS = 200
 
 
-@dataclass(frozen=True, slots=True)
-class Profiles:
+@dataclass(frozen=True, slots=True, repr=False)
+class Profiles(HasShortForm):
     """Trials that methods solve, and their work.
 
     Parameters

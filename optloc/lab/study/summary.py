@@ -17,7 +17,7 @@ import numpy as np
 
 from optloc.lab.study.folder import read_frame
 from optloc.lab.study.trial import FAILED, VALUES
-from optloc.problem import Array, InvalidProblem
+from optloc.problem import Array, HasShortForm, InvalidProblem
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -353,8 +353,8 @@ class Side:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
+@dataclass(frozen=True, slots=True, repr=False)
+class Difference(HasShortForm):
     """Difference of two studies in one cell.
 
     Parameters

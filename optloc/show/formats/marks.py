@@ -7,7 +7,7 @@ covariance is along east, north and, in space, up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,9 +21,12 @@ from optloc.base.types import Array, Status
 from optloc.problem.chart import CARTESIAN, NAMES
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.show.columns import UNCHECKED, Columns, records
+from optloc.show.columns import Columns, level_covariance, records
 from optloc.show.knowledge import known_features
 from optloc.show.origin_time import iso_of
+from optloc.show.render import line_of_answer
+from optloc.show.row_answer import RowSource, state_table
+from optloc.tracking.entry import scan_sentence
 
 if TYPE_CHECKING:
     from optloc.uncertainty.outline import Outline
@@ -81,8 +84,8 @@ class Mark:
         Name of the target.
     time : float
         Time, s; NaN if unknown.
-    status, reason : str
-        Status and reason of the fix, or of the scan of a track.
+    status : str
+        Status of the fix, or label of the scan of a track.
     position : array (d,)
         Position in the frame, m; NaN if unknown.
     covariance : array (d, d)
@@ -93,6 +96,8 @@ class Mark:
         Covariance along east, north and up, m^2; NaN if unknown or not valid.
     velocity : array (d,), optional
         Velocity along east, north and up, m/s.
+    row : RowSource
+        Row of the table of the mark, for its texts.
     others : tuple of Other
         Alternatives.
     """
@@ -105,9 +110,9 @@ class Mark:
     covariance: Array
     place: Array
     level: Array
-    velocity: Array | None = None
+    velocity: Array | None
+    row: RowSource
     others: tuple[Other, ...] = ()
-    reason: str = ""
 
     @property
     def known(self) -> bool:
@@ -132,19 +137,10 @@ class Mark:
 
     @property
     def words(self) -> str:
-        """Return a sentence with the status, the uncertainty and the number of alternatives."""
-        parts = [self.status + (f" ({self.reason})" if self.reason else "")]
-        if self.covers:
-            major, minor, bearing = ellipse(self.level)
-            scale = float(error_ellipse(np.eye(2))[0][0])
-            axes = f"{scale * major:.3g} m x {scale * minor:.3g} m"
-            parts.append(f"95 % ellipse {axes} (semi-axes), bearing of the long axis {bearing:.0f} deg")
-            if len(self.level) == 3:
-                parts.append(f"sigma of the height {np.sqrt(self.level[2, 2]):.3g} m")
-        elif self.known:
-            parts.append("no valid ellipse")
-        parts += [f"{len(self.others)} alternatives"] if self.others else []
-        return "; ".join(parts)
+        """Return the answer of the mark in one line, in the words of a printed fix, and its number of alternatives."""
+        count = len(self.others)
+        others = f" {count} alternative{'s' if count > 1 else ''}." if count else ""
+        return line_of_answer(self.row.answer) + others
 
 
 def need_earth(frame: Frame, what: str, where: str) -> None:
@@ -155,27 +151,60 @@ def need_earth(frame: Frame, what: str, where: str) -> None:
 
 
 def mark_of(
-    frame: Frame, position: Array, covariance: Array, status: str, *, velocity: Array | None = None, **named: Any
+    frame: Frame,
+    position: Array,
+    covariance: Array,
+    status: str,
+    *,
+    velocity: Array | None = None,
+    row: RowSource | None = None,
+    sentence: str = "",
+    texts: Mapping[str, Any] | None = None,
+    **named: Any,
 ) -> Mark:
-    """Return the mark of a position (d,), m, with covariance (d, d), m^2, and velocity (d,), m/s, in a frame.
+    """Return the mark of a state in a frame.
 
-    If the status has no valid covariance, the covariance of the mark is NaN. `named` holds other fields of `Mark`.
+    If the status has no valid covariance, the covariance of the mark is NaN.
+
+    Parameters
+    ----------
+    frame : Frame
+        Frame of the position.
+    position, velocity : array (d,)
+        Position, m, and velocity, m/s.
+    covariance : array (m, m)
+        Covariance of the position, m = d, or of a state that begins with position and velocity, m >= 2 d.
+    status : str
+        Status of the fix, or label of the scan of a track.
+    row : RowSource, optional
+        Row of a table that has the state. By default, it is made of the other arguments.
+    sentence : str
+        Sentence of the status, without `row`; by default the sentence of `Status`.
+    texts : mapping of str, optional
+        Other entries of the row, without `row`: `reason`, `unchecked`, `undetermined`.
+    **named
+        Other fields of `Mark`.
     """
-    place, axes = np.full(3, np.nan), np.eye(len(position))
-    covers = status in _VALID_STATUSES and bool(np.isfinite(covariance).all())
+    d = len(position)
+    if row is None:
+        about = {name: [value] for name, value in {"status": status, **(texts or {})}.items()}
+        rates = None if velocity is None else velocity[None]
+        row = RowSource(state_table(frame, position[None], covariance[None], rates, **about), 0, sentence)
+    columns, i, place = row.columns, row.number, np.full(3, np.nan)
     if frame.geodetic and np.isfinite(position).all():
-        lat, lon, height = frame.to_geodetic(position)
-        place = np.array([np.degrees(lon), np.degrees(lat), height])
-        axes = frame.enu_axes(position)
-    kept = covariance if covers else np.full_like(covariance, np.nan)
-    moving = None if velocity is None else axes @ velocity
+        place = np.array([columns[name][i] for name in ("lon_deg", "lat_deg", "height")], dtype=float)
+    placed = covariance[:d, :d]
+    level = level_covariance(columns, i)
+    covers = status in _VALID_STATUSES and bool(np.isfinite(placed).all() and np.isfinite(level).all())
+    axes = np.eye(d) if velocity is None or not np.isfinite(place).all() else frame.enu_axes(position)
     return Mark(
         position=position,
-        covariance=kept,
+        covariance=placed if covers else np.full_like(placed, np.nan),
         status=status,
         place=place,
-        level=axes @ kept @ axes.T,
-        velocity=moving,
+        level=level if covers else np.full_like(level, np.nan),
+        velocity=None if velocity is None else axes @ velocity,
+        row=row,
         **named,
     )
 
@@ -239,8 +268,27 @@ class Results:
 
     def marks(self) -> list[Mark]:
         """Return one mark for each row of the table."""
-        found = self._others()
-        return [self._mark(row, others) for row, others in zip(records(self.columns), found, strict=True)]
+        found, sources = self._others(), self._sources()
+        rows = zip(records(self.columns), found, sources, strict=True)
+        return [self._mark(row, others, source) for row, others, source in rows]
+
+    def _sources(self) -> list[RowSource]:
+        """Return the source of each row: with its fix if each row is a fix, and with the sentence of a scan of a track.
+
+        The words of all marks come from these sources.
+        """
+        statuses = self.columns["status"].tolist()
+        if self.course:
+            return [RowSource(self.columns, i, scan_sentence(status)) for i, status in enumerate(statuses)]
+        flat = self._flat()
+        if sum(map(len, flat)) != self._count:
+            return [RowSource(self.columns, i) for i in range(self._count)]
+        items = [(fix, item) for fix in flat for item in range(len(fix))]
+        return [RowSource(self.columns, i, "", fix, item) for i, (fix, item) in enumerate(items)]
+
+    def _flat(self) -> list[Fix]:
+        """Return the fixes as batches with one axis."""
+        return [fix if len(fix.shape) == 1 else fix.flat() for fix in self.fixes]
 
     def stations(self) -> list[tuple[str, Array]]:
         """Return the name of each station with its longitude, latitude (degrees) and height (m) (3,)."""
@@ -261,14 +309,14 @@ class Results:
 
     def known(self) -> list[list[tuple[dict[str, Any], dict[str, Any]]]]:
         """Return GeoJSON geometries with properties for each row without a valid position; see `known_features`."""
-        flat = [fix if len(fix.shape) == 1 else fix.flat() for fix in self.fixes]
+        flat = self._flat()
         # This needs fixes of one position each, so that each row is a fix.
         if not self.frame.geodetic or sum(map(len, flat)) != self._count:
             return [[] for _ in range(self._count)]
         return [known_features(fix[i], self.frame) for fix in flat for i in range(len(fix))]
 
-    def _mark(self, row: dict[str, Any], others: tuple[Other, ...]) -> Mark:
-        """Return the mark of a row of the table, with its alternatives `others`.
+    def _mark(self, row: dict[str, Any], others: tuple[Other, ...], source: RowSource) -> Mark:
+        """Return the mark of a row of the table, with its alternatives `others` and its source.
 
         If the fix is Gaussian only in other coordinates than metres, its covariance is not valid and the mark gets NaN.
         """
@@ -289,7 +337,7 @@ class Results:
             target=str(row.get("target", "target")),
             time=float(number.get("time", np.nan)),
             others=others,
-            reason="; ".join(part for part in (row["reason"], UNCHECKED if row.get("unchecked") else "") if part),
+            row=source,
         )
 
     def _name(self, row: dict[str, Any]) -> str:

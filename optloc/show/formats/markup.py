@@ -102,15 +102,16 @@ def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
 
     A mark without a position is a placemark without a geometry. `area` is the region; None if it is not known.
     """
+    words = mark.words
     if not mark.known:
-        _placemark(document, mark.name, mark.words, "doubtful", mark)
+        _placemark(document, mark.name, words, "doubtful", mark)
         return
     style, dimension = "ok" if mark.sure else "doubtful", len(mark.position)
     label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
-    _point(_placemark(document, label, mark.words, style, mark), mark.place, dimension)
+    _point(_placemark(document, label, words, style, mark), mark.place, dimension)
     if area is not None:
         word = area.role.replace("95", ", 95 %, cut off" if area.cut else ", 95 %")
-        _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
+        _polygons(_placemark(document, f"{mark.name}: {word}", words, style), area)
     for number, other in enumerate(mark.others, 1):
         place = _placemark(document, _alternative_name(mark, number), _alternative_text(mark, other), "alternative")
         _point(place, other.place, dimension)

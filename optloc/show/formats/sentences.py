@@ -117,7 +117,7 @@ def _pose(mark: Mark, frame: str) -> str:
 
 def _comment(mark: Mark) -> str:
     """Return comment lines with the name, the status and the position of a mark, and with its alternatives."""
-    lines = [f"{mark.name}: {mark.words}" + (f" at {_spelled(mark.position)}" if mark.known else "")]
+    lines = [f"{mark.name}: {mark.words}" + (f" Position: {_spelled(mark.position)} m." if mark.known else "")]
     lines += [
         f"alternative at {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others
     ]

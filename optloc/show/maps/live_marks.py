@@ -11,6 +11,7 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.show.formats.marks import Mark, ellipse95
 from optloc.show.maps.map_marks import map_row
+from optloc.show.row_answer import use_rows
 
 # Decimals of a degree, and of a metre, in the feed: a tenth of a millimetre.
 _DEGREES, _METRES = 9, 4
@@ -31,18 +32,20 @@ def live_mark(frame: Frame, mark: Mark, trail: Sequence[Array] = ()) -> dict[str
     Returns
     -------
     dict
-        `name`, `time`, `status`, `look`, `place`, `copied`, `size` and `note` as in `MapRow`. `at` is longitude and
-        latitude, degrees, or x and y, m. `trail` has the same for each position. `ellipse` has the semi-axes of the
-        95 % ellipse, m, and the bearing of the long axis, degrees; None without a valid covariance.
+        `name`, `time`, `status`, `look`, `place`, `copied`, `size` and `note` as in `MapRow`. `sentence` is the
+        sentence of the status. `at` is longitude and latitude, degrees, or x and y, m. `trail` has the same for each
+        position. `ellipse` has the semi-axes of the 95 % ellipse, m, and the bearing of the long axis, degrees; None
+        without a valid covariance.
     """
-    known = mark.covariance if mark.covers else np.full_like(mark.covariance, np.nan)
-    row = map_row(frame, mark.name, mark.time, mark.status, mark.reason, False, mark.position, known)
+    source = mark.row
+    row = map_row(frame, source.columns, source.number, mark.name, mark.time)
+    sentence = dict(use_rows(source.columns, source.number, source.sentence)).get("", "")
     texts = {name: getattr(row, name) for name in ("name", "time", "status", "look", "place", "copied", "size", "note")}
     axes = None
     if mark.covers:
         axes = list(ellipse95(mark.level))
     places = [_place(frame, position) for position in trail]
-    return {**texts, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
+    return {**texts, "sentence": sentence, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
 
 
 def _place(frame: Frame, position: Array) -> list[float]:

@@ -10,13 +10,15 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
-from optloc.base.types import Array, Status
+from optloc.base.types import Array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.show.columns import UNCHECKED
+from optloc.show.answer_texts import place_rows, sure_rows
+from optloc.show.columns import Columns, fix_columns, join_tables, level_covariance
 from optloc.show.maps.canvas import MapRow
 from optloc.show.pictures.outlines import level_planes
 from optloc.show.pictures.scene import is_local, regions_of, states_of
+from optloc.show.row_answer import state_table, use_rows, why_rows
 from optloc.uncertainty.outline import Outline
 
 # Corners of an ellipse: one for every five degrees; the last corner repeats the first.
@@ -176,14 +178,11 @@ def fixed_spots(
     """
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
-    statuses = [each for fix in fixes for each in _statuses(fix)]
+    columns = join_tables([fix_columns(fix) for fix in fixes])
     count = len(position)
     names = list(labels) if len(labels) == count else [""] * count
     when = list(times) if len(times) == count else [np.nan] * count
-    rows = tuple(
-        map_row(problem.frame, *each)
-        for each in zip(names, when, *zip(*statuses, strict=True), position, covariance, strict=True)
-    )
+    rows = tuple(map_row(problem.frame, columns, i, names[i], when[i]) for i in range(count))
     sentences = [row_text(row if count > 1 else replace(row, name="", time="")) for row in rows]
     outlines = regions_of(problem, fixes, count, [level_planes(problem, position)])
     for i, regions in enumerate(outlines):
@@ -198,49 +197,42 @@ def fixed_spots(
     return replace(found, local=local, rows=rows, groups=trail)
 
 
-def _statuses(fix: Fix) -> list[tuple[str, str, bool]]:
-    """Return status, reason, and whether there is no redundancy, for each position of fixes, in their order."""
-    flat = fix if len(fix.shape) == 1 else fix.flat()
-    alone = np.ravel(flat.unchecked)
-    each = [(Status(int(flat.code[i])).label, str(flat.reason[i]), bool(alone[i])) for i in range(len(flat))]
-    # A run has several positions for each fix.
-    return [one for position, _, _ in states_of(fix) for one in each for _ in range(len(position) // len(flat))]
+def map_row(frame: Frame, columns: Columns, i: int, name: str = "", time: float = np.nan) -> MapRow:
+    """Return the row of the list for row `i` of a table of fixes or scans, in the words of a printed fix.
 
-
-def map_row(
-    frame: Frame,
-    name: str,
-    time: float,
-    status: str,
-    reason: str,
-    unchecked: bool,
-    position: Array,
-    covariance: Array,
-) -> MapRow:
-    """Return the row of the list for one position (d,), m, with covariance (d, d), m^2.
-
-    `time` is in seconds, NaN if it is unknown. `unchecked` means that the fix has no redundancy.
+    Parameters
+    ----------
+    frame : Frame
+        Frame of the positions.
+    columns : dict of str to array
+        Table of the fixes, see `optloc.show.columns.fix_columns` and `optloc.show.row_answer.state_table`.
+    i : int
+        Number of the row.
+    name : str
+        Name of the row.
+    time : float
+        Time, s; NaN if it is unknown.
     """
-    note = "; ".join(part for part in (reason, UNCHECKED if unchecked else "") if part)
+    status, noted = str(columns["status"][i]), use_rows(columns, i)[0][1].partition("; ")[2]
+    note = "; ".join(part for part in (*(text for _, text in why_rows(columns, i)), noted) if part)
+    unchecked = "unchecked" in columns and bool(columns["unchecked"][i])
     row = MapRow(name, time_text(time), status, look_of(status, unchecked=unchecked), note=note)
+    position = np.array([columns[axis][i] for axis in "xyz" if axis in columns], dtype=float)
     if not np.isfinite(position).all():
         return replace(row, place="", size="no position")
-    axes = frame.enu_axes(position)
     # The variance of a coordinate that a constraint fixes is rounding, and can be negative.
-    variance = np.diagonal(axes @ covariance @ axes.T)
+    variance = np.diagonal(level_covariance(columns, i))
     sigma = np.sqrt(np.where(variance > _ROUNDING * np.max(variance), variance, np.nan))
-    names = ("east", "north", "up") if frame.geodetic else ("in x", "in y", "in z")
-    parts = [f"{metres(s)} {axis}" for s, axis in zip(sigma, names, strict=False) if np.isfinite(s)]
-    sizes = [f"sigma {', '.join(parts)}"] if parts else []
+    sizes = [f"{label}: {text}" for label, text in sure_rows(columns, i)]
     if not frame.geodetic:
         digits = _decimals(sigma, 1)
         values = [f"{value:.{digits}f}" for value in position]
         shown = ", ".join(f"{axis} {value} m" for axis, value in zip("xyz", values, strict=False))
         return replace(row, place=shown, copied=", ".join(values), size="; ".join(sizes))
-    lat, lon, height = frame.to_geodetic(position)
+    places = dict(place_rows(columns, i))
     digits = _decimals(sigma[:2], _DECIMALS)
-    place = f"{np.degrees(lat):.{digits}f}, {np.degrees(lon):.{digits}f}"
-    tall = [f"height {float(height):.{max(digits - _DECIMALS, 0)}f} m"] if len(position) > 2 else []
+    place = f"{columns['lat_deg'][i]:.{digits}f}, {columns['lon_deg'][i]:.{digits}f}"
+    tall = [f"height: {places['height']}"] if len(position) > 2 else []
     return replace(row, place=place, copied=place, size="; ".join([*tall, *sizes]))
 
 
@@ -252,13 +244,6 @@ def _decimals(sigma: Array, least: int) -> int:
     known = sigma[np.isfinite(sigma) & (sigma > 0.0)]
     extra = int(np.ceil(-np.log10(known.min()))) if len(known) else 0
     return least + min(max(extra, 0), _MOST_DECIMALS - _DECIMALS)
-
-
-def metres(length: float) -> str:
-    """Return a length, m, as text with three digits, in km from 1000 m on."""
-    return (
-        f"{length:.3g} m" if length < 999.5 else f"{length / 1e3:.3g} km" if length < 1e6 else f"{length / 1e3:.0f} km"
-    )
 
 
 def time_text(time: float) -> str:
@@ -293,42 +278,32 @@ def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
     position = np.concatenate(places)
     count, d = position.shape
     unknown = np.full((count, d, d), np.nan)
-    rows = tuple(
-        replace(
-            map_row(problem.frame, "", np.nan, f"alternative, cost gap {gap:.3g}", "", False, *each), look="rival other"
-        )
-        for gap, each in zip(gaps, zip(position, unknown, strict=True), strict=True)
-    )
+    columns = state_table(problem.frame, position, unknown, status=[f"alternative, cost gap {gap:.3g}" for gap in gaps])
+    rows = tuple(replace(map_row(problem.frame, columns, i), look="rival other") for i in range(count))
     found = spots(problem, position, unknown, np.zeros(count, dtype=bool), [row_text(row) for row in rows])
     return replace(found, rows=rows)
 
 
-def scan_spots(
-    problem: Problem,
-    position: Array,
-    covariance: Array,
-    scans: Sequence[tuple[str, str, float, str, str]],
-    clean: Array,
-) -> Spots:
+def scan_spots(problem: Problem, columns: Columns, names: Sequence[str], clean: Array) -> Spots:
     """Return the marks of the scans of tracks.
 
     Parameters
     ----------
     problem : Problem
         Gives the frame.
-    position, covariance : array (n, d), (n, d, d)
-        Positions, m, and covariances, m^2; NaN before the start of a track.
-    scans : sequence of n tuples
-        Target, name, time (s), status and reason of each scan.
+    columns : dict of str to array
+        Table of the scans (n rows) with the columns `time`, `target` and `status`; NaN before the start of a track.
+    names : sequence of n str
+        Name of each scan.
     clean : bool array (n,)
         Whether the status is ok.
     """
-    rows = tuple(
-        map_row(problem.frame, name, time, status, reason, False, *values)
-        for (_, name, time, status, reason), values in zip(scans, zip(position, covariance, strict=True), strict=True)
-    )
+    axes = "xyz"[: problem.dimension]
+    position = np.stack([columns[axis] for axis in axes], axis=-1)
+    covariance = np.stack([np.stack([columns[f"cov_{min(a, b)}{max(a, b)}"] for b in axes], -1) for a in axes], -2)
+    rows = tuple(map_row(problem.frame, columns, i, name, columns["time"][i]) for i, name in enumerate(names))
     found = spots(problem, position, covariance, clean, [row_text(row) for row in rows])
-    return replace(found, rows=rows, groups=tuple(target for target, *_ in scans))
+    return replace(found, rows=rows, groups=tuple(columns["target"].tolist()))
 
 
 def station_spots(problem: Problem) -> Spots:

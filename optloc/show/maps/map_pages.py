@@ -33,6 +33,7 @@ from optloc.show.maps.map_lines import constraint_lines, ground_tracks, lines_on
 from optloc.show.maps.map_marks import LOOKS, NO_SPOTS, Spots, fixed_spots, map_row, other_spots, station_spots
 from optloc.show.maps.projection import Plane, map_limits
 from optloc.show.page import LISTED, PagePart, write_page
+from optloc.show.row_answer import state_table
 
 HELP = "Drag to move. Wheel, pinch, + or − to zoom. Select a mark, on the map or in the list, for details."
 """Text below a map while nothing is selected."""
@@ -93,12 +94,13 @@ def _answer(fix: Fix, labels: Sequence[str]) -> FixAnswer:
     return answer_of(fix, most=LISTED)
 
 
-def track_page(problem: Problem, tracks: Spots, title: str) -> str:
+def track_page(problem: Problem, tracks: Spots, title: str, answer: FixAnswer | None = None) -> str:
     """Return an HTML page with an interactive map of the scans of tracks; `tracks` are their marks.
 
-    `problem` gives the stations, and `title` is the title of the page.
+    `problem` gives the stations, and `title` is the title of the page. `answer` is the text above the map.
     """
-    return _marks_page(problem, tracks, NO_SPOTS, title, "track", None)
+    answers = () if answer is None else (replace(answer, title=""),)
+    return _marks_page(problem, tracks, NO_SPOTS, title, "track", None, answers=answers)
 
 
 def live_page(problem: Problem, title: str) -> str:
@@ -153,8 +155,9 @@ def _station_texts(problem: Problem) -> list[tuple[str, str]]:
     """Return the name and the coordinates of each station as texts."""
     d = problem.dimension
     position = problem.stations.position.reshape(-1, problem.stations.count, d)[0]
-    unknown = np.full((d, d), np.nan)
-    rows = [map_row(problem.frame, "", np.nan, "", "", False, place, unknown) for place in position]
+    unknown = np.full((len(position), d, d), np.nan)
+    columns = state_table(problem.frame, position, unknown, status=[""] * len(position))
+    rows = [map_row(problem.frame, columns, i) for i in range(len(position))]
     return [
         (name, ", ".join(filter(None, (row.place, row.size))))
         for name, row in zip(problem.stations.names, rows, strict=True)

@@ -23,20 +23,33 @@ _ABOVE: dict[int, Literal["bottom", "center", "top"]] = {-1: "top", 0: "center",
 _MARK, _MANY = 5.0, 200
 # Largest length of a scale bar, and size of the corner in which marks are counted, as shares of a panel.
 _BAR, _NEAR = 0.25, 0.38
+# Width and height of the corner that a scale bar with its text covers, as shares of a panel.
+_BAR_CORNER = (0.34, 0.16)
 
 
-def free_corner(panel: Axes, vertical: Sequence[str] = ("upper", "lower"), taken: str = "") -> tuple[str, bool]:
+def free_corner(
+    panel: Axes, taken: str = "", size: tuple[float, float] = (_NEAR, _NEAR), first: str = "upper"
+) -> tuple[str, bool]:
     """Return the corner with the fewest marks of a panel with final limits, and whether it is without marks.
 
-    The corner is a text such as "upper left". `vertical` are the edges to choose from, and `taken` is a corner that is
-    not free.
+    Parameters
+    ----------
+    panel : Axes
+        The panel.
+    taken : str
+        A corner that is not free, such as "upper left".
+    size : tuple of float
+        Width and height of the corner, as shares of the panel.
+    first : str
+        The edge that is preferred if corners have equal numbers of marks: "upper" or "lower".
     """
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     marks = panel.transData.inverted().transform(mark_positions(panel))
     share = (marks - [west, south]) / [east - west, north - south]
+    edges = {"upper": 1.0, "lower": 0.0} if first == "upper" else {"lower": 0.0, "upper": 1.0}
     counts = {
-        f"{row} {column}": int(((np.abs(share - [x, {"upper": 1.0, "lower": 0.0}[row]]) < _NEAR).all(-1)).sum())
-        for row in vertical
+        f"{row} {column}": int(((np.abs(share - [x, y]) < size).all(-1)).sum())
+        for row, y in edges.items()
         for column, x in (("right", 1.0), ("left", 0.0))
         if f"{row} {column}" != taken
     }
@@ -45,9 +58,9 @@ def free_corner(panel: Axes, vertical: Sequence[str] = ("upper", "lower"), taken
 
 
 def scale_bar(panel: Axes, unit: str, taken: str = "") -> None:
-    """Draw a scale bar in the lower corner with fewer marks, in a plan with final limits.
+    """Draw a scale bar in the corner with the fewest marks, in a plan with final limits.
 
-    `taken` is a corner that is not free.
+    `taken` is a corner that is not free. The lower corners are preferred.
     """
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
@@ -55,7 +68,7 @@ def scale_bar(panel: Axes, unit: str, taken: str = "") -> None:
     most = _BAR * (east - west)
     power = 10.0 ** np.floor(np.log10(most))
     length = power * next(n for n in (5.0, 2.0, 1.0) if n * power <= most)
-    corner, _ = free_corner(panel, ("lower",), taken)
+    corner, _ = free_corner(panel, taken, _BAR_CORNER, "lower")
     style: dict[str, Any] = {"pad": 0.3, "borderpad": 0.4, "sep": 3, "size_vertical": 0.004 * (north - south)}
     bar = AnchoredSizeBar(panel.transData, length, f"{length:g} {unit}", corner, frameon=True, **style)
     bar.patch.set(edgecolor="none", alpha=0.8)
@@ -68,6 +81,7 @@ def separate_notes(figure: Figure | SubFigure, panels: Sequence[Axes] | None = N
     A note stays in its panel. It takes the first free position around its point. If no position is free, it covers
     as few others as possible.
     """
+    from matplotlib.offsetbox import AnchoredOffsetbox
     from matplotlib.text import Annotation
 
     # Sizes of texts are known only after the layout of the whole figure, also for a part of a figure.
@@ -80,8 +94,9 @@ def separate_notes(figure: Figure | SubFigure, panels: Sequence[Axes] | None = N
         spots = panel.transData.transform(np.array([note.xy for note in notes]))
         taken = [_box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in mark_positions(panel)]
         taken += [text.get_window_extent() for text in panel.texts if text not in notes and text.get_visible()]
-        # An inset with its title hides notes below it.
+        # An inset with its title hides notes below it, and a scale bar too.
         taken += [box for each in panel.child_axes if (box := each.get_tightbbox()) is not None]
+        taken += [artist.get_window_extent() for artist in panel.artists if isinstance(artist, AnchoredOffsetbox)]
         for note, (x, y) in zip(notes, spots, strict=True):
             # A note may touch the box of its mark, because it is drawn next to the mark.
             taken.append(_move_to_free_place(note, panel, [box for box in taken if not box.contains(x, y)]))

@@ -41,14 +41,14 @@ _FAR = 5e3
 
 
 def figure_class() -> type[Figure]:
-    """Return the figure class of matplotlib; raise InvalidProblem if matplotlib is not installed."""
+    """Return the class of figures, which notebooks show; raise InvalidProblem if matplotlib is not installed."""
     try:
-        from matplotlib.figure import Figure
+        from optloc.show.pictures.notebook_figure import NotebookFigure
     except ImportError:
         raise InvalidProblem(
             "pictures need matplotlib", "plot", "install it with: pip install 'optloc[plot]'"
         ) from None
-    return Figure
+    return NotebookFigure
 
 
 def axes_or_new(ax: Axes | None, width: float = 6.4, height: float = 5.6) -> Axes:

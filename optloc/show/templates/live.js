@@ -49,10 +49,10 @@ const openLive = ({ map, sheet, data, list, show }) => {
     copy.dataset.copy = one.copied;
     copy.setAttribute("aria-label", `copy coordinates of ${one.name}`);
     place.append(span("", one.place, "code"), " ", copy);
-    item.append(pick, place, ...[one.size, one.note].filter(Boolean).map(text => span("size", text)));
+    item.append(pick, place, ...[one.sentence, one.size, one.note].filter(Boolean).map(text => span("size", text)));
     return item;
   };
-  const tellOf = one => [one.name, one.time || one.seen, one.status, one.place, one.size, one.note].filter(Boolean).join(", ");
+  const tellOf = one => [one.name, one.time || one.seen, one.status, one.sentence, one.place, one.size, one.note].filter(Boolean).join(", ");
   const draw = found => {
     const at = found.map(one => drawn(one.at)), size = found.length <= 12 ? 12 : 8;
     layers.trails.replaceChildren(...found.filter(one => one.trail.length > 1)

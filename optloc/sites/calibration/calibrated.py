@@ -34,6 +34,7 @@ from optloc.sites.calibration.gauge import (
     fixed_by,
     flat,
     in_frame,
+    is_mirror_image,
     over,
     spans,
     with_mean_clock,
@@ -41,7 +42,7 @@ from optloc.sites.calibration.gauge import (
 from optloc.sites.calibration.likelihood import Likelihood, NetworkEstimate, likelihood, together
 from optloc.sites.calibration.multi_start import NetworkSearchResult, frame_size, proven, search
 from optloc.sites.calibration.network import Network
-from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, NetworkFacts, shorten
+from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, NetworkFacts, mirror_words, shorten
 from optloc.sites.calibration.outliers import PRICE, outliers
 from optloc.sites.calibration.restarts import laid
 from optloc.solvers import AMBIGUOUS_GAP, LISTED_GAP, objections
@@ -53,6 +54,9 @@ if TYPE_CHECKING:
 _CORE = 60
 # Method for the other pulses; their proof follows with the proofs of all pulses.
 _QUICK = "gtrs+lsr"
+MIRROR_IMAGE = "The mirror image"
+"""Name of the alternative that is the mirror image of the network."""
+
 # Difference of distances, as a share of the size, from which two networks are different.
 _ALIKE = 1e-3
 # Two networks are one result if their difference has at least this probability under the covariance.
@@ -319,7 +323,9 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
     alternatives = _alternatives(lik, at, cost, found, others)
     pulses = at.pulses[0].copy()
     pulses[[block.index for block in checked if not block.station and not block.proven]] = np.nan
-    rivals = [other for other in alternatives if other.gap < AMBIGUOUS_GAP]
+    images = [other for other in alternatives if other.gap < AMBIGUOUS_GAP and other.what == MIRROR_IMAGE]
+    mirror = mirror_words(net, at.stations[0], images[0].stations, images[0].gap) if images else ""
+    rivals = [other for other in alternatives if other.gap < AMBIGUOUS_GAP and other.what != MIRROR_IMAGE]
     # A rival with the same stations makes only its moved pulses ambiguous; other rivals make the network ambiguous.
     same = [_same_stations(at, other, covariance) for other in rivals]
     for other in (one for one, alike in zip(rivals, same, strict=True) if alike):
@@ -327,7 +333,7 @@ def _judge(lik: Likelihood, at: NetworkEstimate, found: NetworkSearchResult, nam
     elsewhere = tuple(one for one, alike in zip(rivals, same, strict=True) if not alike)
     others_named = tuple((other.what, other.gap) for other in elsewhere)
     facts = NetworkFacts(
-        net, found, rank, p, tuple(sides), departs, checked, others_named, np.isnan(pulses).any(axis=1)
+        net, found, rank, p, tuple(sides), departs, checked, others_named, np.isnan(pulses).any(axis=1), mirror
     )
     findings = objections(NETWORK_FINDINGS, facts)
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
@@ -390,7 +396,7 @@ def _alternatives(
         others = others + [("another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
     if soft:
         both = laid(at, net, np.random.default_rng(0))  # the network, then its mirror image
-        others = [*others, ("the mirror image", both.take(np.array([1])))]
+        others = [*others, (MIRROR_IMAGE, both.take(np.array([1])))]
     if not others:
         return ()
     ends, costs = lik.refine(together(*(one for _, one in others)))
@@ -406,7 +412,8 @@ def _alternatives(
             shapes.append(shape)
             words = others[i][0]
             placed = one if soft else over(one, at)
-            what = words[0].upper() + words[1:]
+            # Starts also end at the mirror image, so its shape decides the name.
+            what = MIRROR_IMAGE if is_mirror_image(one, at, _ALIKE * scale) else words[0].upper() + words[1:]
             out.append(Alternative(what, max(gap, 0.0), placed.stations[0], placed.pulses[0]))
     return tuple(out)
 

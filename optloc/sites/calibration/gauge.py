@@ -151,6 +151,20 @@ def over(one: NetworkEstimate, at: NetworkEstimate) -> NetworkEstimate:
     )
 
 
+def is_mirror_image(one: NetworkEstimate, at: NetworkEstimate, tolerance: float) -> bool:
+    """Return whether network `one` is the mirror image of network `at` (S = 1 each), up to a motion in space.
+
+    All distances of stations and pulses to stations agree within `tolerance`, m, and no rotation maps one to the other.
+    """
+    a, b = (np.concatenate([each.stations[0], each.pulses[0]]) for each in (one, at))
+    m = at.stations.shape[1]
+    apart = [np.linalg.norm(points[:, None] - points[None, :m], axis=-1) for points in (a, b)]
+    if np.abs(apart[0] - apart[1]).max() > tolerance:
+        return False
+    u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
+    return bool(np.linalg.det(u @ v) < 0.0)
+
+
 def _span(columns: Array) -> Array:
     """Return an orthonormal basis (P, g) of the space of the columns (P, k)."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)

@@ -17,6 +17,10 @@ from optloc.solvers import P_MISFIT, Finding
 # Largest share of pulses with two possible positions. More of them have many combinations of sides, and the cheapest
 # combination can give a wrong shape of the stations. At 3 cm noise, flat stations appear 0.1 to 0.3 m thick.
 _TWOFOLD = 0.5
+# For smaller cost gaps the sentence is "fits equally well": more zeros would not help a reader.
+_ALIKE = 1e-3
+# Standard deviations between the two sides of a suggested prior: the wrong side costs 25 more: it is not listed.
+_SIDES = 5.0
 
 
 def _open_words(net: Network, rank: GaugeRank) -> str:
@@ -30,6 +34,35 @@ def _open_words(net: Network, rank: GaugeRank) -> str:
     return (
         f"The measurements do not determine {count} motion{'s' if count > 1 else ''} of the network, mostly of "
         f"{', '.join(largest)}; add pulses outside their plane, distances between stations, or known positions."
+    )
+
+
+def gap_words(gap: float) -> str:
+    """Return the words on a rival network whose cost is larger by `gap`: "fits equally well", or its cost."""
+    return "fits equally well" if gap < _ALIKE else f"raises chi-square by {gap:.2g}"
+
+
+def rival_words(what: str, gap: float) -> str:
+    """Return the sentence on another network that fits the data; `what` is the difference, and `gap` its cost."""
+    name = f"{what[0].upper()}{what[1:]}"
+    return f"{name} {gap_words(gap)}, so the data do not decide between the networks; add pulses or known positions."
+
+
+def mirror_words(net: Network, stations: Array, image: Array, gap: float) -> str:
+    """Return the sentence on a mirror image that known positions do not exclude, with the line that excludes it.
+
+    `stations` and `image` (M, d) are the positions in the network and in its mirror image, m; `gap` is the cost of the
+    image. The line is for the station and the coordinate that differ most, among the unknown ones.
+    """
+    apart = np.abs(stations - image)
+    unknown = ~np.isfinite(net.place_sigma)
+    apart[~unknown] *= float(not unknown.any())
+    i, c = np.unravel_index(int(apart.argmax()), apart.shape)
+    here, there, axis, name = stations[i, c], image[i, c], "xyz"[c], net.names[i]
+    line = f'{{ name = "{name}", {axis} = {here:.4g}, sigma = {apart[i, c] / _SIDES:.2g} }}'
+    return (
+        f"The mirror image {gap_words(gap)}; state in the file on which side {name} is: {line} as here, or "
+        f"{axis} = {there:.4g} as in the mirror image."
     )
 
 
@@ -59,6 +92,8 @@ class NetworkFacts:
         Difference and cost gap of networks with other stations that fit about equally well.
     twofold : bool array (N,)
         Pulses without a unique position.
+    mirror : str
+        Sentence on a mirror image that fits about equally well; empty without one.
     """
 
     net: Network
@@ -70,6 +105,7 @@ class NetworkFacts:
     blocks: tuple[StationBlock, ...]
     elsewhere: tuple[tuple[str, float], ...]
     twofold: Array
+    mirror: str = ""
 
     @property
     def refuted(self) -> list[str]:
@@ -85,6 +121,7 @@ class NetworkFacts:
 NETWORK_FINDINGS = (
     Finding(Status.SINGULAR_GEOMETRY, lambda e: e.motions.open.shape[1], lambda e: [_open_words(e.net, e.motions)]),
     Finding(Status.AMBIGUOUS, lambda e: e.sides, lambda e: e.sides),
+    Finding(Status.AMBIGUOUS, lambda e: e.mirror, lambda e: [e.mirror]),
     Finding(Status.CURVED, lambda e: e.departure > STRAIGHT, lambda e: [_curved_words(e.departure)]),
     Finding(
         Status.MISFIT,
@@ -94,10 +131,7 @@ NETWORK_FINDINGS = (
     Finding(
         Status.AMBIGUOUS,
         lambda e: e.elsewhere,
-        lambda e: [
-            f"Another network fits the data: {what[0].lower()}{what[1:]}, cost + {gap:.2g}; add pulses or positions."
-            for what, gap in e.elsewhere
-        ],
+        lambda e: [rival_words(what, gap) for what, gap in e.elsewhere],
     ),
     Finding(
         Status.AMBIGUOUS,

@@ -110,6 +110,7 @@ def _show(found: Calibration) -> None:
     from rich.table import Table
 
     from optloc.cli import Screen, say
+    from optloc.sites.calibration.network_findings import gap_words
 
     console, net = Screen(), found.network
     say(console, f"status {found.status.label}, proof {found.proof}; frame of {found.gauge}")
@@ -133,7 +134,10 @@ def _show(found: Calibration) -> None:
         table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(values**2)):.2f}" if values.size else "-")
     console.print(table)
     for other in found.alternatives[:5]:
-        say(console, f"{other.what}: cost + {other.gap:.3g}")
+        say(console, f"{other.what} {gap_words(other.gap)}.")
+    if not np.isfinite(net.place_sigma).any():
+        needed = f"known positions of {net.dimension} stations and one coordinate of another station"
+        say(console, f"A network without known positions also fits as its mirror image; {needed} exclude it.")
 
 
 def _record(found: Calibration, file: Path) -> dict[str, Any]:

@@ -234,7 +234,7 @@ def _losses_table(found: Placement) -> Table:
         table.add_column(heading, justify="left" if heading in ("station", "best replacement") else "right")
     for swap in found.swaps[:_LINES]:
         then = f"{np.sqrt(swap.replaced):.4g}" if swap.replacement else ""
-        table.add_row(swap.name, f"{np.sqrt(swap.value):.4g}", swap.replacement or "-", then)
+        table.add_row(swap.name, f"{np.sqrt(swap.value):.4g}", swap.replacement or "none allowed", then)
     return table
 
 

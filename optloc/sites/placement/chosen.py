@@ -59,7 +59,8 @@ class Swap:
     value : float
         The criterion without this station, m^2.
     replacement : str
-        The site that replaces it best; empty if no site can.
+        The site that replaces it best; empty if the rules allow none. The replacement of a kept station is beyond the
+        number of new sites and the budget.
     replaced : float
         The criterion with the replacement, m^2; equal to `value` without a replacement.
     """
@@ -311,7 +312,7 @@ def _placement(
         sites,
         share,
         _redundancy(candidates, chosen),
-        tuple(_swaps(task, names, chosen)),
+        tuple(_swaps(candidates, chosen)),
         tuple((_select_names(names, (one == 1) & (candidates.state != 1)), task.scale(v)) for v, one in found.best),
         tuple(_next_sites(task, names, chosen)),
         _course_in_m2(task, found.course),
@@ -389,19 +390,23 @@ def _redundancy(candidates: Candidates, chosen: Array) -> Array:
     return np.asarray(degrees_of_freedom(problem))
 
 
-def _swaps(task: SearchTask, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
+def _swaps(candidates: Candidates, chosen: Array) -> Iterator[Swap]:
     """Yield the effect of the loss of each taken site, with the best replacement; largest loss first.
 
-    `names` are the n sites; `chosen` (n,) is 1 for each taken site.
+    `chosen` (n,) is 1 for each taken site. The replacement of a kept site is one new site more than the search took. So
+    only the rules of the groups apply to it: the number of new sites and the budget do not limit it.
     """
-    found = []
+    task, names, found = task_of(candidates), candidates.names, []
+    rules, limits = candidates.group_rules
+    for_kept = replace(task, rules=rules, limits=limits)
     for i in np.flatnonzero(chosen).tolist():
         without = chosen.copy()
         without[i] = 0
         value = task.scale(float(task.score(without[None])[0]))
         tries = np.repeat(without[None], len(chosen), axis=0)
         tries[np.arange(len(chosen)), np.arange(len(chosen))] = 1
-        others = np.flatnonzero((chosen == 0) & (task.state != 0) & task.fits(tries)).tolist()
+        allowed = (for_kept if task.state[i] == 1 else task).fits(tries)
+        others = np.flatnonzero((chosen == 0) & (task.state != 0) & allowed).tolist()
         if others:
             values = task.score(tries[others])
             best = int(values.argmin())

@@ -151,6 +151,13 @@ class Candidates:
     limits: Array
     state: Array
 
+    @property
+    def group_rules(self) -> tuple[Array, Array]:
+        """Return the rules and limits of the groups. The other rules are the number and the cost of new sites."""
+        count = sum((group.most is not None) + (group.least is not None) for group in self.selection.groups)
+        first = len(self.rules) - count
+        return self.rules[first:], self.limits[first:]
+
     def assembled(self, chosen: Array) -> Problem:
         """Return the batch of P problems with the rows of the taken sites, as input of `optloc.crlb`.
 

@@ -1,15 +1,19 @@
 """optloc study: bad commands are one sentence; a study runs, tells its state and is compared."""
 
 from collections import Counter
+from io import StringIO
 from math import inf
+from types import SimpleNamespace
 
 import pytest
 from lab.study.test_design import sentence
 from lab.study.texts import QUICK
+from rich.console import Console
 from typer.testing import CliRunner
 
-from optloc.cli import app
-from optloc.lab.commands.study import _in_words, _quartiles
+from optloc.cli import app, show_sheet
+from optloc.lab.commands.study import _in_words, _quartiles, _show_pairs, _status_sheet
+from optloc.lab.study.paired import Median, Pair
 
 RUN = CliRunner()
 
@@ -56,3 +60,38 @@ def test_counts_are_told_by_the_most_common():
 def test_quartiles_stand_around_the_median():
     assert _quartiles((2.0, 3.5, inf)) == "3.5 [2, ∞]"
     assert _quartiles(None) == "-"
+
+
+@pytest.mark.parametrize("width", [80, 120, 300])
+def test_headings_of_statuses_are_whole_words_at_any_width(width):
+    statuses = [
+        "ok",
+        "unproven",
+        "too few rows",
+        "singular geometry",
+        "max iterations",
+        "contradictory",
+        "disconnected",
+    ]
+    methods = {(f"method number {i} of many", name): 7 for i in range(2) for name in statuses}
+    found = SimpleNamespace(counts=dict.fromkeys(statuses, 14), methods=methods)
+    stream = StringIO()
+    show_sheet(_status_sheet(found, width), Console(file=stream, width=width))
+    text = stream.getvalue()
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    words = {word for name in statuses for word in name.split()}
+    assert words <= set(text.replace("│", " ").replace("┃", " ").split())
+
+
+def test_headings_of_pairs_fit_in_80_characters():
+    medians = Median(-0.12, -0.34, 0.11, 0.5), Median(1.2, 0.98, 1.4, 0.5)
+    share = (0.5, 0.4, 0.6)
+    one = Pair("case", "1 ns", "gauss-newton from the box", "auto", 100, 12, 13, *share, 0.031, *medians)
+    stream = StringIO()
+    _show_pairs([one], Console(file=stream, width=80))
+    lines = stream.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    text = " ".join(" ".join(line.replace("┃", " ").replace("│", " ").split()) for line in lines)
+    for word in ("difference,", "ratio", "trials", "right", "gauss-newton", "[-0.34, 0.11]"):
+        assert word in text

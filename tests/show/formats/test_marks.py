@@ -6,6 +6,7 @@ from show.ranging import ENU, ranged
 
 from optloc import InvalidProblem
 from optloc.base.frames import CARTESIAN
+from optloc.base.types import Status
 from optloc.problem import ECEF
 from optloc.show.columns import fix_columns
 from optloc.show.formats.marks import Results, ellipse, geojson, mark_of, need_earth
@@ -31,13 +32,14 @@ def test_a_mark_is_level_on_earth():
     assert found.place == pytest.approx([8.0, 47.0, 400.0])
     assert found.level == pytest.approx(np.diag([1.0, 4.0, 9.0]), abs=1e-9)
     assert found.velocity == pytest.approx([0.0, 5.0, 0.0], abs=1e-12)
-    assert "long axis 0 deg" in found.words or "long axis 180 deg" in found.words
+    assert found.words.startswith(f"ok. {Status.OK.sentence} latitude: 47.0000000 deg")
+    assert "sigma east, north, up: 1, 2, 3 m" in found.words
 
 
 def test_what_is_not_ok_has_a_position_without_a_covariance():
     found = mark("ambiguous")
     assert (found.known, found.sure, found.covers) == (True, False, False)
-    assert "no valid ellipse" in found.words
+    assert "if this position is correct" in found.words
 
 
 def test_large_times_are_dates():

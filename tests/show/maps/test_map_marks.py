@@ -10,16 +10,17 @@ import optloc
 from optloc.base.types import Status
 from optloc.problem import CARTESIAN
 from optloc.show import fix_page
+from optloc.show.describe_fix import answer_of
 from optloc.show.maps.map_marks import (
     fixed_spots,
     look_of,
     map_row,
-    metres,
     other_spots,
     scan_spots,
     station_spots,
     time_text,
 )
+from optloc.show.row_answer import state_table
 
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
 
@@ -65,8 +66,8 @@ def test_a_row_has_status_time_and_coordinates():
     assert (row.name, row.time, row.status, row.look) == ("one", "2023-11-14 22:13:20 UTC", "ok", "ok")
     lat, lon = (float(part) for part in row.copied.split(", "))
     assert (lon, lat) == pytest.approx(marks.place[0], abs=1e-5)
-    assert row.size.startswith("sigma 1.")
-    assert row.size.endswith("north")
+    printed = answer_of(fix).section("how sure").rows
+    assert row.size == "; ".join(f"{label}: {text}" for label, text in printed)
 
 
 def test_each_target_has_its_trail():
@@ -94,30 +95,24 @@ def test_each_status_has_a_class():
 
 def test_small_ellipses_have_more_decimals():
     problem, _ = ranged()
-    rows = [
-        map_row(problem.frame, "", np.nan, "ok", "", False, np.array([10.0, 20.0]), sigma**2 * np.eye(2))
-        for sigma in (3.0, 0.3, 0.002, 1e-7)
-    ]
+    sigma = np.array([3.0, 0.3, 0.002, 1e-7])
+    places, covariance = np.tile([10.0, 20.0], (4, 1)), sigma[:, None, None] ** 2 * np.eye(2)
+    columns = state_table(problem.frame, places, covariance, status=["ok"] * 4)
+    rows = [map_row(problem.frame, columns, i) for i in range(4)]
     assert [len(row.place.partition(",")[0].partition(".")[2]) for row in rows] == [5, 6, 8, 8]
 
 
 def test_a_plane_frame_has_metres():
-    row = map_row(CARTESIAN, "a", 2.5, "ok", "", True, np.array([1.0, -2.0, 3.0]), np.diag([4.0, 9.0, 0.0]))
+    place, covariance = np.array([[1.0, -2.0, 3.0]]), np.diag([4.0, 9.0, 0.0])[None]
+    row = map_row(CARTESIAN, state_table(CARTESIAN, place, covariance, status=["ok"], unchecked=[True]), 0, "a", 2.5)
     assert row.place == "x 1.0 m, y -2.0 m, z 3.0 m"
     assert row.copied == "1.0, -2.0, 3.0"
-    assert row.size == "sigma 2 m in x, 3 m in y"  # a constraint fixes z
+    assert row.size.startswith("sigma x, y, z: 2, 3, 0 m")  # a constraint fixes z
     assert row.time == "2.5 s"
     assert "no redundancy" in row.note
 
 
-def test_lengths_and_times_are_short():
-    assert [metres(value) for value in (0.0123, 12.34, 999.6, 45678.0, 2e6)] == [
-        "0.0123 m",
-        "12.3 m",
-        "1 km",
-        "45.7 km",
-        "2000 km",
-    ]
+def test_times_are_short():
     assert time_text(float("nan")) == ""
     assert time_text(1.7e9 + 0.25) == "2023-11-14 22:13:20.250 UTC"
 
@@ -132,8 +127,9 @@ def test_alternatives_have_rows():
 def test_scans_form_one_trail_for_each_target():
     problem, fix = ranged()
     place, covariance = np.stack([fix.position, np.full(2, np.nan)]), np.stack([fix.covariance()] * 2)
-    scans = [("t", "t 1", 0.0, "ok", ""), ("t", "t 2", 1.0, "starting", "too few rows")]
-    found = scan_spots(problem, place, covariance, scans, np.array([True, False]))
+    texts = {"status": ["ok", "starting"], "reason": ["", "too few rows"], "target": ["t", "t"]}
+    columns = state_table(problem.frame, place, covariance, **texts) | {"time": np.array([0.0, 1.0])}
+    found = scan_spots(problem, columns, ["t 1", "t 2"], np.array([True, False]))
     assert found.groups == ("t", "t")
     assert [row.size == "no position" for row in found.rows] == [False, True]
 

@@ -1,8 +1,9 @@
 """Notes cover neither each other nor marks nor insets, and the scale bar and the inset take free corners."""
 
 import numpy as np
+import pytest
 
-from optloc.show.pictures.notes import free_corner, scale_bar, separate_notes
+from optloc.show.pictures.notes import free_corner, mark_positions, scale_bar, separate_notes
 from optloc.show.pictures.style import figure_class, note
 
 
@@ -37,7 +38,28 @@ def test_a_note_leaves_the_place_of_an_inset():
 def test_a_corner_is_free_without_marks():
     panel = panel_with([(9.0, 9.0), (1.0, 9.0), (9.0, 1.0)])
     assert free_corner(panel) == ("lower left", True)
-    assert free_corner(panel, ("lower",), "lower left") == ("lower right", False)
+    assert free_corner(panel, "lower left") == ("upper right", False)
     scale_bar(panel, "m")
     (bar,) = panel.artists
     assert bar.txt_label.get_text() == "2 m"
+
+
+@pytest.mark.parametrize("free", [(9.0, 9.0), (1.0, 9.0), (9.0, 1.0), (1.0, 1.0)])
+def test_a_scale_bar_covers_no_mark_if_a_corner_is_free(free):
+    marks = [point for point in [(9.0, 9.0), (1.0, 9.0), (9.0, 1.0), (1.0, 1.0)] if point != free]
+    panel = panel_with(marks)
+    scale_bar(panel, "m")
+    panel.figure.draw_without_rendering()
+    box = panel.artists[0].get_window_extent()
+    assert not any(box.contains(*place) for place in mark_positions(panel))
+    assert box.contains(*panel.transData.transform([free[0], 9.6 if free[1] > 5.0 else 0.5]))
+
+
+def test_a_note_leaves_the_place_of_a_scale_bar():
+    panel = panel_with([(6.3, 0.4)])
+    scale_bar(panel, "m")
+    note(panel, "a station with a long name", 6.3, 0.4)
+    separate_notes(panel.figure)
+    (bar,) = panel.artists
+    assert bar.loc == bar.codes["lower right"]
+    assert not panel.texts[0].get_window_extent().overlaps(bar.get_window_extent())

@@ -1,5 +1,7 @@
 """Networks from nothing: known answers, what no frame changes, named refusals, and single blocks refuted."""
 
+import re
+
 import numpy as np
 import pytest
 from often import few
@@ -122,6 +124,27 @@ def test_known_places_define_the_frame_and_missing_entries_are_nothing_special()
     assert found.gauge == "known places"
     assert found.stations[:4] == pytest.approx(truth.stations[0, :4])
     assert found.stations == pytest.approx(truth.stations[0], abs=0.3)
+
+
+def test_the_line_against_the_mirror_image_of_three_known_stations_chooses_the_side():
+    truth, z = hall(6, 8, 24, 0.03)
+    place, sigma = np.full((2, 8, 3), np.nan)
+    place[:3], sigma[:3] = truth.stations[0, :3], 0.0
+    found = calibrate(network_of(z, 0.03, place=place, place_sigma=sigma))
+    assert found.status is Status.AMBIGUOUS
+    image = found.alternatives[0]
+    assert image.what == "The mirror image"
+    assert np.isfinite(found.pulses).all()
+    (sentence,) = found.findings
+    name, axis, here, width = re.search(r'name = "A(\d)", ([xyz]) = (\S+), sigma = (\S+) }', sentence).groups()
+    entry = int(name) - 1, "xyz".index(axis)
+    assert found.stations[entry] == pytest.approx(float(here), rel=1e-3)
+    sigma[entry] = float(width)
+    for stations in (found.stations, image.stations):  # the user knows on which side the station is
+        place[entry] = stations[entry]
+        decided = calibrate(network_of(z, 0.03, place=place, place_sigma=sigma))
+        assert decided.status is Status.OK
+        assert decided.stations == pytest.approx(stations, abs=1e-2)
 
 
 def test_differences_and_two_way_ranges():

@@ -14,6 +14,7 @@ from optloc.sites.calibration.gauge import (
     flat,
     frame_moves,
     in_frame,
+    is_mirror_image,
     over,
     shifted,
     with_mean_clock,
@@ -92,6 +93,16 @@ def test_a_turned_and_mirrored_network_is_laid_over_the_other(seed):
         found = over(moved, truth)
         np.testing.assert_allclose(found.stations, truth.stations, atol=1e-9)
         np.testing.assert_allclose(found.pulses, truth.pulses, atol=1e-9)
+
+
+def test_only_a_reflection_is_a_mirror_image(seed):
+    truth, _ = hall(3, 6, 8, 0.0)
+    turn = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))  # a rotation of space
+    for sign, longer in ((1.0, 1.0), (-1.0, 1.0), (-1.0, 1.01)):
+        maps = [sign * longer * points @ turn + 7.0 for points in (truth.stations, truth.pulses)]
+        one = replace(truth, stations=maps[0], pulses=maps[1])
+        assert is_mirror_image(one, truth, 1e-6) == (sign < 0.0 and longer == 1.0)
 
 
 def test_moves_shift_stations_and_then_clocks():

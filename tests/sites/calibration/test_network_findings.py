@@ -6,7 +6,7 @@ import numpy as np
 from trades.messages import LONGEST, names_step
 
 from optloc import Status
-from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, shorten
+from optloc.sites.calibration.network_findings import NETWORK_FINDINGS, mirror_words, rival_words, shorten
 from optloc.solvers import objections
 
 
@@ -17,7 +17,7 @@ def facts(**changes):
     motions = SimpleNamespace(open=np.zeros((6, 0)))
     values = {
         "net": net, "found": found, "motions": motions, "p": 0.4, "sides": (), "departure": np.nan, "elsewhere": (),
-        "twofold": np.zeros(4, dtype=bool), "refuted": [], "unproven": [],
+        "twofold": np.zeros(4, dtype=bool), "refuted": [], "unproven": [], "mirror": "",
     }  # fmt: skip
     return SimpleNamespace(**(values | changes))
 
@@ -28,7 +28,10 @@ def test_a_network_without_an_objection_has_no_finding():
 
 def test_each_finding_is_short_and_names_a_next_step():
     many = [f"station Anchor-{i}" for i in range(9)]
+    net = SimpleNamespace(names=("Church tower",), place_sigma=np.full((1, 3), np.inf))
+    mirror = mirror_words(net, np.array([[1234.5678, 0.0, 1.0]]), np.array([[-1234.5678, 0.0, 1.0]]), 3.21)
     worst = facts(
+        mirror=mirror,
         motions=SimpleNamespace(open=np.ones((6, 3))), departure=20.0, p=0.0, elsewhere=(("Pulse 7 elsewhere", 3.2),),
         twofold=np.ones(400, dtype=bool), refuted=many, found=SimpleNamespace(agreeing=1, made=144),
     )  # fmt: skip
@@ -42,3 +45,10 @@ def test_each_finding_is_short_and_names_a_next_step():
 def test_more_than_three_names_are_counted():
     assert shorten(list("abc")) == "a, b, c"
     assert shorten(list("abcdef")) == "a, b, c and 3 more"
+
+
+def test_a_rival_without_a_difference_of_cost_is_not_decided():
+    assert rival_words("another network", 2e-12).startswith(
+        "Another network fits equally well, so the data do not decide"
+    )
+    assert "raises chi-square by 3.2, so the data do not decide" in rival_words("another network", 3.21)

@@ -1,12 +1,14 @@
 """Placements: the best of all sets by enumeration, what each answer tells, and sets that are not to come again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sites.placement.scenes import every_set, hall
 
 from formulations.placement import covariances
 from optloc import place
-from optloc.sites.placement import SiteSelection
+from optloc.sites.placement import CountGroup, SiteSelection
 from optloc.sites.placement.chosen import _ban_sets, _bounds_after_loss, _next_sites, _swaps, task_of
 from optloc.sites.placement.sites import candidates_of
 
@@ -53,7 +55,7 @@ def test_what_each_loss_costs_and_each_addition_gains_are_sets_of_their_own(sele
     lost = np.array([np.where(np.arange(7) == i, 0, chosen) for i in range(5)])
     each = variances_of(selection, lost)
     assert _bounds_after_loss(candidates, chosen) == pytest.approx(np.sqrt(each.max(axis=0)), rel=1e-9)
-    costs = {swap.name: swap.value for swap in _swaps(task, names, chosen)}
+    costs = {swap.name: swap.value for swap in _swaps(candidates, chosen)}
     assert [costs[name] for name in names[:5]] == pytest.approx(each.mean(axis=1), rel=1e-9)
     more = np.array([np.where(np.arange(7) == i, 1, chosen) for i in (5, 6)])
     gained = dict(_next_sites(task, names, chosen))
@@ -65,3 +67,21 @@ def test_a_banned_set_is_the_only_one_that_is_not_allowed(selection):
     assert task.fits(sets).all()
     left = _ban_sets(task, [sets[3], sets[8]]).fits(sets)
     assert np.flatnonzero(~left).tolist() == [3, 8]
+
+
+def test_a_lost_station_that_was_kept_has_a_replacement_beyond_the_new_sites(selection):
+    """Four kept stations and one new site: the replacement of a kept station is the best other candidate."""
+    names = selection.problem.stations.names
+    own = replace(selection, kept=names[:4], choose=1)
+    swaps = {swap.name: swap for swap in place(own).swaps}
+    new = next(name for name in swaps if name not in own.kept)
+    left = [name for name in names[4:] if name != new]
+    for name in own.kept:
+        sets = np.array([np.isin(names, [*(set(swaps) - {name}), other]).astype(int) for other in left])
+        each = variances_of(own, sets).mean(axis=1)
+        assert swaps[name].replacement == left[each.argmin()]
+        assert swaps[name].replaced == pytest.approx(each.min(), rel=1e-9)
+    full = replace(own, groups=(CountGroup(names, most=5),))
+    assert all(swap.replacement for swap in place(full).swaps)
+    closed = replace(own, groups=(CountGroup(left, most=0),))
+    assert [swap.replacement for swap in place(closed).swaps] == [""] * 5
