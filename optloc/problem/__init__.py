@@ -70,7 +70,8 @@ if TYPE_CHECKING:
         windows as windows,
     )
     from optloc.problem.explanations import Explanation as Explanation, Suspect as Suspect
-    from optloc.problem.fix import Active as Active, Alternatives as Alternatives, Fix as Fix, Stage as Stage
+    from optloc.problem.fix import Fix as Fix
+    from optloc.problem.fix_parts import Active as Active, Alternatives as Alternatives, Stage as Stage
     from optloc.problem.forms import form_of as form_of
     from optloc.problem.layout import Layout as Layout, emission_name as emission_name, state_names as state_names
     from optloc.problem.loss import LOSSES as LOSSES, Loss as Loss

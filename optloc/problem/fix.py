@@ -21,6 +21,7 @@ from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
 from optloc.problem.claims import Claims, sentence_of
 from optloc.problem.determined import Determined
 from optloc.problem.explanations import Suspect
+from optloc.problem.fix_parts import Alternatives, Stage
 from optloc.problem.layout import Layout
 from optloc.problem.posed_answer import PosedAnswer
 from optloc.problem.problem import Problem
@@ -39,68 +40,6 @@ _OPEN = 100.0
 # hundredfold scale, and for lengths the distance of the outer planets.
 _OPEN_BY_UNIT = {"m/s": 299_792_458.0, "m/s^2": 299_792_458.0, "rad": 1e3, "1": 100.0, "s": 1e4}
 _OPEN_LENGTH = 1e12
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """One step of the computation of a fix.
-
-    Parameters
-    ----------
-    name : str
-        Method, for instance "gtrs" or "lsr".
-    detail : str
-        Summary of the step in a few words.
-    seconds : float
-        Wall-clock time for the whole batch.
-    """
-
-    name: str
-    detail: str
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class Active:
-    """A constraint that is active: the fix meets it with equality.
-
-    Parameters
-    ----------
-    name : str
-        Name of the constraint and its side, for instance "height upper".
-    multiplier : float
-        Lagrange multiplier, in cost per SI unit of the constrained quantity: positive at an upper bound, negative at a
-        lower bound. The gradient of the cost plus the sum of all multipliers times their gradients is zero.
-    """
-
-    name: str
-    multiplier: float
-
-
-@dataclass(frozen=True, slots=True)
-class Alternatives:
-    """Other minima of the cost, sorted by cost.
-
-    Parameters
-    ----------
-    x : array (..., q, size)
-        Parameter vectors; NaN in unused entries.
-    gap : array (..., q)
-        Cost of each minimum minus the cost of the fix; infinite in unused entries.
-    """
-
-    x: Annotated[Array, Axes(2, slots=True)]
-    gap: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
-
-    @property
-    def doubt(self) -> Array:
-        """Return the probability (..., q) that the alternative is correct, given that either it or the fix is correct.
-
-        Both have the same prior probability, and the likelihood of each is proportional to exp(-cost / 2).
-        """
-        from scipy.special import expit
-
-        return np.asarray(expit(-0.5 * self.gap))
 
 
 Index: TypeAlias = int | np.integer[Any] | slice | list[int] | Array | tuple[int | slice | Array, ...]

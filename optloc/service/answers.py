@@ -317,7 +317,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
 def _probability(each: Record) -> float:
     """Return the probability of an alternative relative to the fix, from its gap (difference of chi-square).
 
-    The formula is the formula of `optloc.problem.fix.Alternatives`.
+    The formula is the formula of `optloc.problem.fix_parts.Alternatives`.
     """
     return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # exp overflows beyond 700
 

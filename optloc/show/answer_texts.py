@@ -8,7 +8,8 @@ import numpy as np
 
 from optloc.base.types import Array, Status
 from optloc.problem.chart import AXES, CARTESIAN, INVERSE_RANGE, NAMES
-from optloc.problem.fix import Active, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Active
 from optloc.show.columns import Columns, level_covariance
 from optloc.show.fix_answer import Row
 from optloc.show.origin_time import origin_text

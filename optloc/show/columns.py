@@ -19,7 +19,8 @@ from optloc.bounds.rank import Observability
 from optloc.problem.chart import AXES, CURVED, INVERSE_RANGE
 from optloc.problem.claims import PROOFS
 from optloc.problem.explanations import Explanation
-from optloc.problem.fix import Active, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Active
 from optloc.show.knowledge import is_shown
 
 Columns = dict[str, Array]

@@ -28,7 +28,7 @@ from optloc.model_checks.coplanar import (
     is_coplanar,
     is_symmetric,
 )
-from optloc.problem.fix import Stage
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.horizon import is_hidden
 from optloc.solvers.policy import LISTED_GAP, SAME_PLACE

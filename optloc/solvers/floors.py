@@ -12,7 +12,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.records import join
 from optloc.base.types import Array, Band, Status, first_status
 from optloc.problem.claims import GLOBAL, UNKNOWN, Claims
-from optloc.problem.fix import Alternatives, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Alternatives
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import claim_sentence
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP

@@ -17,7 +17,7 @@ from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import Face, face_of, faces, is_conjunctive, on_face, restore, tangent_at
 from optloc.linear.normal import decrement, step, with_station_noise
 from optloc.linear.vectors import complete
-from optloc.problem.fix import Stage
+from optloc.problem.fix_parts import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import bound_pool, by_least_squares, without_broken

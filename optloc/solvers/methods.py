@@ -16,7 +16,8 @@ from optloc.base.registry import Registry
 from optloc.base.types import Array, Certificate, Status
 from optloc.engine.plan import plan_of
 from optloc.problem.claims import GLOBAL, REGION, Claims, claim
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, is_scaled, why_unsupported

@@ -11,7 +11,8 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.problem.claims import Claims, empty_claims, merged_claims
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Curvature, NoStart, Pool, begin
 from optloc.solvers.stages import Solver

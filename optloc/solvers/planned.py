@@ -29,7 +29,7 @@ from optloc.linear.normal import depends_on_place, with_station_noise
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.linear.vectors import vectors, without_biases
 from optloc.model_checks.shape import BENT
-from optloc.problem.fix import Active, Stage
+from optloc.problem.fix_parts import Active, Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.coplanar import join_sides

@@ -21,7 +21,8 @@ from optloc.base.types import Array, Status
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 
 PART = 2**15

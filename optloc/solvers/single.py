@@ -36,7 +36,8 @@ from optloc.model_checks.truncation import are_near, has_law
 from optloc.problem.chart import CARTESIAN, CURVED, Chart, quantile
 from optloc.problem.claims import Claims, claim, repeated_claims
 from optloc.problem.epochs import separable
-from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Alternatives, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest, ProofResult, empty_answer, lacks_code, prove_here
 from optloc.proof.local_search import OTHER, UNIQUE

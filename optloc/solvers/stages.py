@@ -25,7 +25,8 @@ from optloc.linear.mirror import mirror, one_position
 from optloc.linear.normal import decrement, step
 from optloc.linear.vectors import problem_at_rest, vectors
 from optloc.models.layers import Layers
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_scaled, why_unsupported
 from optloc.solvers.around import starts_on_equalities

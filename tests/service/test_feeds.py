@@ -44,7 +44,7 @@ def test_cursor_on_target_has_a_pending_event_and_then_its_update(on_earth, z, t
         point = judged.find("point")
         assert float(point.get("lat")) == pytest.approx(truth[0][i], abs=1e-8)
         assert float(point.get("ce")) < 100.0 < float(pending.find("point").get("ce"))
-        assert judged.find("detail/remarks").text.startswith("ok")
+        assert judged.find("detail/remarks").text.startswith("ok. ")
 
 
 def test_a_parser_of_cursor_on_target_reads_the_update(on_earth, z, truth):

@@ -7,7 +7,7 @@ import pytest
 from model_checks.small import PLACE, SQUARE
 
 from optloc import Status, assemble, measured
-from optloc.problem.fix import Stage
+from optloc.problem.fix_parts import Stage
 from optloc.solvers.pool import _sum_stages, begin, chunk_size, in_parts, noting_place, offer, pack
 
 

@@ -39,7 +39,8 @@ from optloc.linear.vectors import vectors
 from optloc.model_checks.truncation import has_law
 from optloc.problem.claims import GLOBAL, REGION, Claims, empty_claims
 from optloc.problem.epochs import by_epoch, separable
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest
 from optloc.proof.local_search import BETTER, STATIONARY, VALUE

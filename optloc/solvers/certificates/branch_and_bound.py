@@ -25,7 +25,8 @@ from optloc.linear.constraints import TOLERANCE, exact, violation, violation_nam
 from optloc.linear.vectors import vectors
 from optloc.problem.chart import quantile
 from optloc.problem.claims import GLOBAL, PROOFS, REGION, UNKNOWN, Claims, claim, empty_claims
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import ProofRequest, ProofResult
 from optloc.proof.global_search import UNBOUNDED

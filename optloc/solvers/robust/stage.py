@@ -17,7 +17,8 @@ from optloc.linear.constraints import Face, exact
 from optloc.linear.normal import Normal, marginal
 from optloc.linear.redundancy import degrees_of_freedom
 from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import bound_pool

@@ -27,7 +27,8 @@ from optloc.problem.arrival_times import Arrivals, as_arrivals, restore_order, s
 from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.explanations import Explanation, GroupKind, Suspect
-from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Alternatives, Stage
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem

@@ -22,7 +22,8 @@ from optloc.kernels.jit import enabled
 from optloc.model_checks.evidence import Influence, drops, embed, errors, influence, significance
 from optloc.model_checks.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.problem.claims import GLOBAL
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, is_scaled
 from optloc.solvers.certificates.admitted import certified

@@ -10,7 +10,8 @@ import numpy as np
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.problem.claims import claim
 from optloc.problem.explanations import Explanation, Suspect
-from optloc.problem.fix import Alternatives, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Alternatives
 from optloc.problem.problem import Problem
 
 _SHOWN = 4  # names in a sentence: a longer list does not help

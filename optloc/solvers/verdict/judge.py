@@ -25,7 +25,8 @@ from optloc.model_checks.truncation import covariance_of
 from optloc.models import MODELS
 from optloc.models.layers import Layers
 from optloc.problem.claims import Claims, claim, merged_claims, repeated_claims
-from optloc.problem.fix import Alternatives, Fix
+from optloc.problem.fix import Fix
+from optloc.problem.fix_parts import Alternatives
 from optloc.problem.problem import Problem
 from optloc.problem.truncated import Truncated
 from optloc.solvers.policy import FAR, FLAT, P_SUSPECT, REJECTED, WEAK

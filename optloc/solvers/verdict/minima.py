@@ -21,7 +21,7 @@ from optloc.linear.normal import Normal, local_covariance, marginal
 from optloc.linear.vectors import vectors
 from optloc.linear.walks import walk_names
 from optloc.model_checks.scaled_rows import runs_backwards
-from optloc.problem.fix import Active, Stage
+from optloc.problem.fix_parts import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.horizon import lowest_sight

@@ -8,7 +8,7 @@ from model_checks.small import PLACE, SQUARE, ranges_to
 
 from optloc import Status
 from optloc.kernels.sums import equations_at
-from optloc.problem.fix import Stage
+from optloc.problem.fix_parts import Stage
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.minima import (
