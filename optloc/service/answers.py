@@ -201,6 +201,7 @@ def unproven(event: Event, why: str, before: Record | None) -> Record:
     """
     proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
     proof |= {"target": event.target} if event.target else {}
+    proof |= {"revision": event.revision} if event.revision > 1 else {}
     names = shown_name(event.name)
     if before is not None:
         return {**names, "phase": "proof", "status": before["status"], **proof}

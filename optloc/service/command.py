@@ -331,30 +331,27 @@ def run_live(file: Path, options: ServiceOptions) -> int:
         if settings.track and stream.untracked:
             raise InvalidProblem(stream.untracked, "--track", "remove this option")
         interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
-        places = _open(options, stream, adapter, stops)
+        places = _open(options, stream, adapter)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(options, stream, adapter, recording)
         code = wait(stream, interrupted)
-        say(json.dumps({"health": stream.health()}))
+        stream.sources.stop()  # so that no line comes after the last line of health
         failed = stream.sources.failed
         if failed:
-            say(f"The stream ends with exit code {code}: {', '.join(failed)} failed.")
+            say(f"The stream ends with exit code {code}, because these sources do not work: {', '.join(failed)}.")
+        say(json.dumps({"health": stream.health()}))
     return code
 
 
-def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None, stops: ExitStack) -> str:
-    """Open the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message.
-
-    `stops` receives the functions that stop the sources.
-    """
+def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None) -> str:
+    """Start the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
     from optloc.service import serve as requests
     from optloc.service.sources import mqtt, zeromq
 
     opened = ""
     if options.http is not None:
         host, port = address_of(options.http)
-        number, stop = requests.serve(stream, host, port, options.access)
-        stops.callback(stop)
+        number, _ = requests.serve(stream, host, port, options.access)
         opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
     for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
         if address is not None:

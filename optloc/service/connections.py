@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from ipaddress import ip_address, ip_network
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from uvicorn.protocols.http.h11_impl import H11Protocol as _Protocol
+else:
+    _Protocol = object  # uvicorn is an extra: `protocol_of` adds its class
 
 MOST, EACH = 512, 128
 """Largest number of connections, and of connections of one address: a proxy may keep 128 open."""
@@ -91,83 +96,89 @@ def group_of(address: str) -> str:
     return str(ip.ipv4_mapped if ip.version == 6 else ip)
 
 
-def protocol_of(connections: Connections, head: float = HEAD, whole: float = WHOLE) -> Any:
-    """Return a class of uvicorn protocols whose connections have the limits of `connections`.
+class BoundedConnection(_Protocol):
+    """HTTP/1.1 with limits; the class of uvicorn has no limit for the headers of a request."""
+
+    places: Connections
+    head: float
+    whole: float
+
+    def connection_made(self, transport: Any) -> None:
+        """Accept a connection, or answer 503 if there is no place."""
+        super().connection_made(transport)
+        self.address = self.client[0] if self.client else ""
+        self.since = self.loop.time()
+        self.timer = self.loop.call_later(self.head, self.check)
+        if not self.places.admit(self):
+            self.refuse(b"503 Service Unavailable", b"too many connections")
+
+    @property
+    def is_silent(self) -> bool:
+        """Return whether no request of the connection is being answered."""
+        cycle: Any = self.cycle  # None before the first request
+        return cycle is None or bool(cycle.response_complete)
+
+    def check(self) -> None:
+        """Close the connection if its time is over, or look again at the end of its time.
+
+        The client sent too little of a request, sends a body too slowly, or reads its answer too slowly.
+        """
+        left = self.since + (self.head if self.is_silent else self.whole) - self.loop.time()
+        if left > 0.0:
+            self.timer = self.loop.call_later(left, self.check)
+        else:
+            self.drop()
+
+    def handle_events(self) -> None:
+        """Handle the data of the client; a new request begins a new time limit."""
+        before = self.cycle
+        super().handle_events()
+        if self.cycle is not before:
+            self.since = self.loop.time()
+
+    def on_response_complete(self) -> None:
+        """Begin the time limit of the next request."""
+        self.since = self.loop.time()
+        self.timer.cancel()
+        self.timer = self.loop.call_later(self.head, self.check)
+        super().on_response_complete()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """Pass the connection to the protocol of websockets, which has other limits."""
+        self.leave()
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Release the place of the connection."""
+        self.leave()
+        super().connection_lost(exc)
+
+    def leave(self) -> None:
+        """Release the place of the connection and stop its timer."""
+        self.timer.cancel()
+        self.places.release(self)
+
+    def drop(self) -> None:
+        """Close the connection at once; data that is not sent is lost."""
+        self.transport.abort()
+
+    def refuse(self, status: bytes, why: bytes) -> None:
+        """Answer with a status and a reason, and close the connection."""
+        body = b'{"error":"%s"}\n' % why
+        self.transport.write(_CLOSED % (status, len(body)) + body)
+        self.transport.close()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer data that are not HTTP."""
+        self.refuse(b"400 Bad Request", b"this is not HTTP/1.1")
+
+
+def protocol_of(places: Connections, head: float = HEAD, whole: float = WHOLE) -> Any:
+    """Return a class of uvicorn protocols whose connections have the limits of `places`.
 
     `head` is the time for the headers of a request, and `whole` the time for its body and its answer, s.
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-    class BoundedConnection(H11Protocol):
-        """HTTP/1.1 with limits; the class of uvicorn has no limit for the headers of a request."""
-
-        def connection_made(self, transport: Any) -> None:
-            """Accept a connection, or answer 503 if there is no place."""
-            super().connection_made(transport)
-            self.address = self.client[0] if self.client else ""
-            self.since = self.loop.time()
-            self.timer = self.loop.call_later(head, self.check)
-            if not connections.admit(self):
-                self.refuse(b"503 Service Unavailable", b"too many connections")
-
-        @property
-        def is_silent(self) -> bool:
-            """Return whether no request of the connection is being answered."""
-            cycle: Any = self.cycle  # None before the first request
-            return cycle is None or bool(cycle.response_complete)
-
-        def check(self) -> None:
-            """Close the connection if its time is over, or look again at the end of its time.
-
-            The client sent too little of a request, sends a body too slowly, or reads its answer too slowly.
-            """
-            left = self.since + (head if self.is_silent else whole) - self.loop.time()
-            if left > 0.0:
-                self.timer = self.loop.call_later(left, self.check)
-            else:
-                self.drop()
-
-        def handle_events(self) -> None:
-            """Handle the data of the client; a new request begins a new time limit."""
-            before = self.cycle
-            super().handle_events()
-            if self.cycle is not before:
-                self.since = self.loop.time()
-
-        def on_response_complete(self) -> None:
-            """Begin the time limit of the next request."""
-            self.since = self.loop.time()
-            self.timer.cancel()
-            self.timer = self.loop.call_later(head, self.check)
-            super().on_response_complete()
-
-        def handle_websocket_upgrade(self, event: Any) -> None:
-            """Pass the connection to the protocol of websockets, which has other limits."""
-            self.leave()
-            super().handle_websocket_upgrade(event)
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            """Release the place of the connection."""
-            self.leave()
-            super().connection_lost(exc)
-
-        def leave(self) -> None:
-            """Release the place of the connection and stop its timer."""
-            self.timer.cancel()
-            connections.release(self)
-
-        def drop(self) -> None:
-            """Close the connection at once; data that is not sent is lost."""
-            self.transport.abort()
-
-        def refuse(self, status: bytes, why: bytes) -> None:
-            """Answer with a status and a reason, and close the connection."""
-            body = b'{"error":"%s"}\n' % why
-            self.transport.write(_CLOSED % (status, len(body)) + body)
-            self.transport.close()
-
-        def send_400_response(self, msg: str) -> None:
-            """Answer data that are not HTTP."""
-            self.refuse(b"400 Bad Request", b"this is not HTTP/1.1")
-
-    return BoundedConnection
+    limits = {"places": places, "head": head, "whole": whole}
+    return type("BoundedProtocol", (BoundedConnection, H11Protocol), limits)

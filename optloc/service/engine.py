@@ -325,7 +325,10 @@ class Engine:
                 taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), BATCH))]
                 self._changed.notify_all()
             for group in _grouped([item for item in taken if not item.done]):
-                self._conclude(group, {id(item.event): item for item in taken})
+                try:
+                    self._conclude(group, {id(item.event): item for item in taken})
+                except Exception:  # an answer that cannot be passed on must not end all proofs
+                    LOG.exception("answers of proofs failed, from %s on", group.events[0].name)
 
     def _conclude(self, group: EventGroup, items: dict[int, Pending]) -> None:
         """Prove the fixes of events, and answer the events that are still open.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from optloc.problem import InvalidProblem
-from optloc.service.access_checks import AccessChecks
+from optloc.service.access_checks import AccessChecks, App
 from optloc.service.alarms import SourceLost
 from optloc.service.connections import Connections, protocol_of
 from optloc.service.endpoints import application
@@ -42,10 +42,41 @@ def serve(
     except (OSError, OverflowError) as error:
         what = f"the address {host}:{port} is not available ({getattr(error, 'strerror', None) or error})"
         raise InvalidProblem(what, "--http", "choose another port") from None
+    app = AccessChecks(application(stream), access, local=is_local(host))
+    number = int(opened[0].getsockname()[1])
+    servers: list[Any] = []
+
+    def run(watch: Watch) -> None:
+        """Serve requests until the server is stopped; raise SourceLost if it ends by itself."""
+        servers[:] = [uvicorn.Server(_config(app))]
+        if watch.stopping.is_set():
+            return
+        watch.works()
+        servers[0].run(sockets=[opened.pop() if opened else _listener(host, number)])
+        if not watch.stopping.is_set():
+            raise SourceLost("the server has ended")
+
+    def interrupt() -> None:
+        """Stop the server soon."""
+        for server in servers:
+            server.should_exit = True
+
+    return number, stream.start(LineSource("http", run, interrupt=interrupt)).stop
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Return a socket that listens at an address; raise OSError or OverflowError if this is not possible."""
+    return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+
+
+def _config(app: App) -> Any:
+    """Return the configuration of one run of the server, with no connections yet."""
+    import uvicorn
+
     # The application has no start-up work (lifespan). Proxy headers are ignored, since any client can write them.
     # Warnings are not logged: a client causes one with each request that is not HTTP.
-    config = uvicorn.Config(
-        AccessChecks(application(stream), access, local=is_local(host)),
+    return uvicorn.Config(
+        app,
         http=protocol_of(Connections()),
         log_level="error",
         access_log=False,
@@ -55,31 +86,3 @@ def serve(
         proxy_headers=False,
         server_header=False,
     )
-    number = int(opened[0].getsockname()[1])
-    servers: list[Any] = []
-
-    def run(watch: Watch) -> None:
-        """Serve requests until the server is stopped; raise SourceLost if it ends by itself."""
-        servers[:] = [uvicorn.Server(config)]
-        if watch.stopping.is_set():
-            return
-        watch.works()
-        servers[0].run(sockets=[opened.pop() if opened else _listener(host, number)])
-        if not watch.stopping.is_set():
-            raise SourceLost("the server has ended")
-
-    running = stream.start(LineSource("http", run))
-
-    def stop() -> None:
-        """Stop the server, and wait some seconds for its end."""
-        running.watch.stopping.set()
-        for server in servers:
-            server.should_exit = True
-        running.stop()
-
-    return number, stop
-
-
-def _listener(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at an address; raise OSError or OverflowError if this is not possible."""
-    return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)

@@ -15,7 +15,7 @@ from optloc.problem import InvalidProblem
 DEPTH = 16
 """Largest depth of lists and objects: a line has 3 levels, an uplink of a gateway about 6."""
 
-# Largest number of digits of a whole number: picoseconds since 1970 have 22.
+# Largest number of digits of a whole number: picoseconds since 1970 have 22, and longer numbers cost quadratic time.
 _DIGITS = 100
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -50,9 +50,9 @@ def read_object(data: bytes, most: int) -> dict[str, Any]:
     Raises
     ------
     InvalidProblem
-        If the line is too long, is not UTF-8, or is not one JSON object (RFC 8259). Also for NaN, infinity and a key
-        that an object has twice. Also for a lone surrogate, more than `DEPTH` levels, and more than 100 digits of a
-        whole number.
+        If the line is too long, is not UTF-8, or is not one JSON object (RFC 8259). Also for NaN, infinity, a key twice
+        in one object, and a lone surrogate. Also for more than `DEPTH` levels, or a whole number of more than 100
+        digits.
     """
     if len(data) > most:
         raise InvalidProblem(f"the line has {len(data)} bytes, more than {most}", None, "send fewer rows in a line")

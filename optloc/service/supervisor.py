@@ -61,12 +61,15 @@ class LineSource:
         Whether the stream ends with this source.
     tries : float
         Number of restarts without success after which the source is given up; infinity: never.
+    interrupt : callable
+        Called after `Watch.stopping` is set, for a source that does not look at it.
     """
 
     name: str
     run: Callable[[Watch], None]
     is_last: bool = False
     tries: float = inf
+    interrupt: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +80,14 @@ class RunningSource:
     watch: Watch
     thread: Thread
 
+    def interrupt(self) -> None:
+        """Tell the source to end."""
+        self.watch.stopping.set()
+        self.source.interrupt()
+
     def stop(self) -> None:
         """End the source, and wait some seconds for its thread."""
-        self.watch.stopping.set()
+        self.interrupt()
         if not self.source.is_last:  # a read of standard input cannot be interrupted
             self.thread.join(_PATIENCE)
 
@@ -121,7 +129,7 @@ class Supervisor:
     def stop(self) -> None:
         """End all sources, and wait some seconds for each."""
         for running in self._running:
-            running.watch.stopping.set()
+            running.interrupt()
         for running in self._running:
             running.stop()
 

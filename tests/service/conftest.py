@@ -1,4 +1,4 @@
-"""A server that the tests of requests share: its stream and its port."""
+"""The site and the server that tests of requests share: one server for each module."""
 
 import pytest
 from service.lines import SITE, Answers, site_in
@@ -11,7 +11,7 @@ def on_earth(tmp_path_factory):
     return site_in(tmp_path_factory.mktemp("earth"), ON_EARTH)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def server(on_earth):
     """Return a stream that listens, and its port."""
     pytest.importorskip("starlette")

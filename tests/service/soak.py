@@ -54,6 +54,7 @@ class Service:
         self.folder, self.answered, self.healths, self.starts = folder, {}, 0, 0
         self.http, self.pull, self._broker, self._threads = free_port(), free_port(), broker, []
         self.last, self.alarms, self.errors = {}, set(), []
+        self.up = threading.Event()  # whether the process reads
 
     def start(self):
         """Start the process, and wait until it is ready."""
@@ -72,10 +73,12 @@ class Service:
             each.start()
         if not ready.wait(120.0):
             raise AssertionError(f"the process is not ready: {self.errors}")
+        self.up.set()
 
     def kill(self):
-        """Kill the process, and read what it has written."""
+        """Kill the process while it gets events, and read what it has written."""
         self.process.send_signal(signal.SIGKILL)
+        self.up.clear()
         self._wait()
 
     def end(self):
@@ -149,14 +152,19 @@ class Sender:
 
     def run(self):
         """Send new events until the end (a thread), and old events that have no answer."""
-        began, first = time.monotonic(), self.sent
+        due, last = 0.0, time.monotonic()
         while not self.ends.is_set():
-            while first + (time.monotonic() - began) * self._rate > self.sent:
+            now = time.monotonic()
+            # a process that starts gets no new events; it would need minutes for them on a busy machine
+            due += self._rate * (now - last) * self._service.up.is_set()
+            last = now
+            while self.sent < due:
                 self._send(f"event-{self.sent}")
                 self.sent += 1
                 if self._rng.random() < 0.1:
                     self._transmit(garbage(self._rng), int(self._rng.integers(2)))
-            self.repeat()
+            if self._service.up.is_set():
+                self.repeat()
             time.sleep(0.01)
 
     def repeat(self):
@@ -205,26 +213,27 @@ def soak(folder, z, seconds, kills, rate=400.0, seed=1):
     sender = Sender(service, broker, z, rate, seed)
     thread = threading.Thread(target=sender.run, daemon=True)
     thread.start()
-    began = time.monotonic()
     breaks = seconds / 24.0
 
-    def until(when):
-        """Restart the broker now and then, and check health, until a time since the start."""
-        while (now := time.monotonic() - began) < when:
-            if now // breaks != (now + 1.0) // breaks:
+    def run_for(duration):
+        """Restart the broker now and then, and check health, for some seconds."""
+        began = broken = time.monotonic()
+        while (now := time.monotonic()) < began + duration:
+            if now > broken + breaks:
+                broken = now
                 broker.stop()
                 time.sleep(1.0)
                 broker.start()
             service.health()
-            time.sleep(min(1.0, max(when - now, 0.0)))
+            time.sleep(min(1.0, max(began + duration - now, 0.0)))
 
-    for kill in range(kills):
-        until(0.5 * seconds * (kill + 1) / kills)
+    for _ in range(kills):
+        run_for(0.5 * seconds / kills)
         service.kill()
         service.start()
-    until(seconds * 2.0 / 3.0)
+    run_for(seconds / 6.0)
     first = service.memory()
-    until(seconds)
+    run_for(seconds / 3.0)
     last = service.memory()
     sender.ends.set()
     thread.join(30.0)

@@ -53,6 +53,8 @@ def test_a_proof_that_was_not_finished_keeps_the_status():
     found = unproven(event(), "deadline", FIX)
     assert (found["phase"], found["status"], found["proof"], found["why"]) == ("proof", "ok", "unknown", "deadline")
     assert "status" not in unproven(event(), "deadline", None)
+    assert "revision" not in found
+    assert unproven(event(revision=2), "deadline", FIX)["revision"] == 2
 
 
 def test_an_unproven_fix_of_a_stream_waits_for_its_proof():

@@ -17,19 +17,15 @@ from optloc.service.standard_error import standard_error
 def test_lines_warnings_and_the_log_go_through_one_queue(monkeypatch):
     file = io.StringIO()
     monkeypatch.setattr(sys, "stderr", file)
-    log = logging.getLogger("optloc")
-    handler = logging.StreamHandler(file)
-    log.addHandler(handler)
-    try:
-        with standard_error() as (say, output):
-            say("a line\x1b[2J")
-            log.warning("a warning")
-            sys.stderr.write("a print\n")
-            assert not sys.stderr.isatty()
-        assert sys.stderr is file
-        assert handler.stream is file
-    finally:
-        log.removeHandler(handler)
+    log, handler = logging.getLogger("optloc"), logging.StreamHandler(file)
+    monkeypatch.setattr(log, "handlers", [handler])
+    with standard_error() as (say, output):
+        say("a line\x1b[2J")
+        log.warning("a warning")
+        sys.stderr.write("a print\n")
+        assert not sys.stderr.isatty()
+    assert sys.stderr is file
+    assert handler.stream is file
     assert file.getvalue().splitlines() == ["a line\\x1b[2J", "a warning", "a print"]
     assert output.dropped == 0
 

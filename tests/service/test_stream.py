@@ -645,6 +645,10 @@ def test_a_reader_that_goes_ends_it(tmp_path):
         (["--replay", "none.ndjson"], "there is no such file"),
         (["--replay", "none.ndjson", "--speed", "0"], "--speed: the speed is 0"),
         (["--late", "never"], "--late: 'never' is unknown"),
+        (["--http", "0.0.0.0:0"], "--http: other machines reach 0.0.0.0, and requests need no token"),
+        (["--http", "0", "--allow-host", "http://a"], "--allow-host: 'http://a' is not a host name"),
+        (["--http", "0", "--token-file", "none.txt"], "there is no such file"),
+        (["--http", "0", "--token-file", "none.txt", "--no-token"], "--no-token: a token is required and not required"),
     ],
 )
 def test_options_that_cannot_be_are_one_sentence(tmp_path, words, said):
