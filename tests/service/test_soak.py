@@ -56,13 +56,13 @@ def test_ten_minutes_at_two_hundred_events_a_second(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
 def test_garbage_restarts_a_full_disk_and_kills_lose_no_event(tmp_path):
-    """For an hour, or OPTLOC_SOAK_MINUTES: 20 kills in the first half, and memory from then on."""
+    """For an hour, or OPTLOC_SOAK_MINUTES: 20 kills in the first half (fewer in less time), and memory from then on."""
     pytest.importorskip("paho.mqtt.client")
     pytest.importorskip("zmq")
     pytest.importorskip("uvicorn")
     site = site_in(tmp_path)
     z = differences(site, drawn(site, 500)).tolist()
-    kills = 20
+    kills = 20 if MINUTES >= 60.0 else max(3, round(MINUTES))  # a start takes seconds on a busy machine
     service, sent, code, (first, last) = soak(tmp_path, z, 60.0 * MINUTES, kills)
     account, again = service.last["account"], sum(len(each) > 1 for each in service.answered.values())
     report(f"{sent} events, {kills} kills, {service.healths} accounts; {again} answers were repeated")

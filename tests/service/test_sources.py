@@ -1,7 +1,9 @@
 """Sources: MQTT and ZeroMQ with restarts of the broker, and standard input that fails."""
 
+import json
 import socket
 import subprocess
+import sys
 import time
 from contextlib import suppress
 from shutil import which
@@ -122,6 +124,29 @@ def test_a_broker_that_refuses_is_an_alarm(stream, broker):
     assert "the broker refuses (" in watch.alarm.error
     broker.refuses = False
     wait_for(lambda: watch.alarm is None)
+
+
+@pytest.mark.slow
+def test_a_command_that_ends_without_its_broker_has_an_exit_code(tmp_path, broker):
+    site_in(tmp_path)
+    address = f"mqtt://127.0.0.1:{broker.port}/t"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "optloc.cli", "live", "site.toml", "--mqtt", address],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    while b"ready: " not in process.stderr.readline():
+        pass
+    wait_for(lambda: broker.subscribers == 1)
+    broker.stop()
+    assert json.loads(process.stdout.readline())["source"] == "mqtt"
+    process.terminate()
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 3
+    why, health = said.splitlines()[-2:]
+    assert why == b"The stream ends with exit code 3, because these sources do not work: mqtt."
+    assert [alarm["name"] for alarm in json.loads(health)["health"]["alarms"]] == ["mqtt"]
 
 
 @pytest.mark.skipif(which("mosquitto") is None, reason="mosquitto is not installed")
