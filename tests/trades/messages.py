@@ -18,7 +18,8 @@ _PROGRESS = re.compile(r"^ *\d+ ms +\S")
 # Titles and lines of results, which report numbers.
 _RESULTS = re.compile(
     r"^(?:\S+ is understood as|The position is .*|Wave speed: .*|[\w ]+: \d+ (?:fixes|scans) *|Alternatives"
-    r"|Stations, m|Suspects|status .*, proof .*|cost .*, \d+ degrees of freedom, .*|Health by .*|\S+|.* cost \+ \S+"
+    r"|Stations, m|Suspects|status .*, proof .*|cost .*, \d+ degrees of freedom, .*|Health by .*|\S+"
+    r"|.* fits equally well\.|.* raises chi-square by \S+"
     r"|Noise from data.*)$"
 )
 # Forms of a next step: an option, a command, a key or call to write, a file, and an order at the start of a clause.

@@ -23,7 +23,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, level_covariance, records
 from optloc.show.knowledge import known_features
-from optloc.show.origin_time import iso_of
+from optloc.show.origin_time import FIRST_DATE, iso_of
 from optloc.show.render import line_of_answer
 from optloc.show.row_answer import RowSource, state_table
 from optloc.tracking.entry import scan_sentence
@@ -37,9 +37,6 @@ _VALID_STATUSES = {Status.OK.label, "started"}
 _STATUSES_WITH_REGION = {*_VALID_STATUSES, Status.CURVED.label}
 # Corners of an ellipse on a map, one for every 5 degrees: it looks smooth at any zoom that shows the whole ellipse.
 _CORNERS = 72
-# Times from this value on, s, count from 1970; smaller times count from the start of a run. A run is shorter than the
-# three years that this value means.
-_DATED = 1e8
 # Dates in names have the digits of this standard deviation, s: milliseconds, as the time stamps of KML and GPX.
 _SHOWN_TIME = 0.01
 
@@ -133,7 +130,7 @@ class Mark:
     def date(self) -> datetime | None:
         """Return the time as a date, UTC; None if the time does not count from 1970."""
         # A float of seconds since 1970 is accurate to less than a microsecond, the resolution of `timedelta`.
-        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.time) if self.time >= _DATED else None
+        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.time) if self.time >= FIRST_DATE else None
 
     @property
     def words(self) -> str:
@@ -415,7 +412,7 @@ class Results:
 def _label(row: dict[str, Any], name: str) -> str:
     """Return the text of a column of a row; for an epoch without a label, whose text is its time, the date in UTC."""
     text, time = str(row[name]), row.get("time")
-    if name != "epoch" or time is None or time < _DATED or text != f"{time:.15g}":
+    if name != "epoch" or time is None or time < FIRST_DATE or text != f"{time:.15g}":
         return text
     return iso_of(time, _SHOWN_TIME)
 

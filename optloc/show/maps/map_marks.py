@@ -16,6 +16,7 @@ from optloc.problem.problem import Problem
 from optloc.show.answer_texts import place_rows, sure_rows
 from optloc.show.columns import Columns, fix_columns, join_tables, level_covariance
 from optloc.show.maps.canvas import MapRow
+from optloc.show.origin_time import FIRST_DATE
 from optloc.show.pictures.outlines import level_planes
 from optloc.show.pictures.scene import is_local, regions_of, states_of
 from optloc.show.row_answer import state_table, use_rows, why_rows
@@ -27,8 +28,6 @@ ELLIPSES = 200
 """Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file."""
 SKY = 100e3
 """Height, m, at which space begins by convention. Satellites have no position on a map."""
-# Times from this value on, s, count from 1970, as in the export formats.
-_DATED = 1e8
 # Decimals of a degree: 5 are a metre. Small ellipses get more, up to 8, a millimetre.
 _DECIMALS, _MOST_DECIMALS = 5, 8
 
@@ -250,7 +249,7 @@ def time_text(time: float) -> str:
     """Return a time, s, as text: a date if it counts from 1970, else seconds; empty if it is NaN."""
     if not np.isfinite(time):
         return ""
-    if time < _DATED:
+    if time < FIRST_DATE:
         return f"{time:.10g} s"
     date = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=float(time))
     return date.isoformat(sep=" ", timespec="milliseconds").replace(".000+00:00", "+00:00").replace("+00:00", " UTC")

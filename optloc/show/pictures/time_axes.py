@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.show.origin_time import FIRST_DATE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Files convert dates to seconds since 1970, UTC. Times from this value on (November 1985) are such dates; smaller times
-# count from the start of a run, a day or a week.
-_DATES = 5e8
 # Units of other times, with their sizes, s. A unit is used if the times span more than three of it: fewer units give
 # ticks such as 0.05 h.
 _UNITS = (("d", 86400.0), ("h", 3600.0), ("min", 60.0))
@@ -60,7 +58,7 @@ def time_scale(times: Array) -> TimeScale:
     """Return the scale of an axis for times (k,), s; NaN times do not count."""
     known = np.asarray(times, dtype=float)
     known = known[np.isfinite(known)]
-    if len(known) and known.min() >= _DATES:
+    if len(known) and known.min() >= FIRST_DATE:
         from matplotlib import dates
 
         # The setting `date.epoch` of matplotlib decides which day is 0.

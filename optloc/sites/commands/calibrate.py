@@ -137,7 +137,7 @@ def _show(found: Calibration) -> None:
         say(console, f"{other.what} {gap_words(other.gap)}.")
     if not np.isfinite(net.place_sigma).any():
         needed = f"known positions of {net.dimension} stations and one coordinate of another station"
-        say(console, f"A network without known positions also fits as its mirror image; {needed} exclude it.")
+        say(console, f"The mirror image of a network without known positions fits, too; to exclude it, add {needed}.")
 
 
 def _record(found: Calibration, file: Path) -> dict[str, Any]:

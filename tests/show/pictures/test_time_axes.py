@@ -34,5 +34,12 @@ def test_dates_are_dates_and_clock_times():
     assert "20:27" in [tick.get_text() for tick in panel.get_xticklabels()]
 
 
+def test_seconds_of_a_week_and_old_gps_times_are_no_dates_of_the_past_century():
+    for first in (345_600_000.0, 9e8):  # a time of week in milliseconds read as seconds, and GPS time of 2008
+        scale = time_scale(first + np.arange(60.0))
+        assert scale.unit == "s"
+        assert scale.values(np.array([first]))[0] == first
+
+
 def test_unknown_times_have_a_scale():
     assert time_scale(np.array([np.nan])).unit == "s"
