@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar, copy_context
-from threading import Lock as LockType
 from time import perf_counter
 from typing import TypeVar
 
@@ -48,28 +47,6 @@ def thread_count() -> int:
     if not given.isdecimal() or int(given) < 1:
         raise InvalidProblem(f"{given!r} is not a number of threads", _VARIABLE, "give a whole number of at least 1")
     return int(given)
-
-
-def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
-    """Register a lock so that it is free in a forked child, and return it. A fork first acquires the lock.
-
-    Without it, a child that forks while another thread holds the lock could wait without end.
-
-    Parameters
-    ----------
-    lock : threading.Lock
-        A lock that lives as long as the process.
-    begin : callable
-        Function that the child calls first.
-    """
-
-    def child() -> None:
-        lock.release()
-        begin()
-
-    if hasattr(os, "register_at_fork"):  # not where processes do not fork
-        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=child)
-    return lock
 
 
 def map_on_threads(
