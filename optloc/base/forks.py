@@ -1,4 +1,4 @@
-"""Locks and imports of threads when the process forks: the child has no other thread, and must not wait for one."""
+"""Locks and imports of threads when the process forks: a forked child has no other threads to wait for."""
 
 from __future__ import annotations
 

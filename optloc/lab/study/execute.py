@@ -24,6 +24,7 @@ from warnings import catch_warnings, filterwarnings, warn
 
 from optloc.lab.study.design import Chunk, StudyDesign, workers
 from optloc.lab.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
+from optloc.lab.study.problem_copies import store_problems
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, join_parts, part_of_lost
 from optloc.lab.study.worker_process import WorkerPool
 from optloc.problem import InvalidProblem, nearest, plugins
@@ -101,6 +102,7 @@ def run_design(
     with locked(folder):
         # The lock excludes other writers, so finished parts stay finished.
         manifest = begin(design, folder)
+        store_problems(design, folder)
         done = finished_parts(folder, manifest, say)
         known = known_data(design, folder, done)
         if tell is not None and done:
