@@ -25,6 +25,7 @@ LAYERS = (
     "tracking station_health",
     "files multi_target",
     "show advice",
+    "partitions",
     "cli",
     # neighbours, which import the faces of the core only
     "sites plugins",

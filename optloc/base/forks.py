@@ -61,7 +61,7 @@ def _finish_imports() -> None:
 
 
 def _before_fork() -> None:
-    """Acquire all locks, the last one first, because locks of higher layers are registered later."""
+    """Acquire all locks, the latest first, because locks of higher layers are registered later."""
     _finish_imports()
     # A copy, because threads may register more locks meanwhile.
     for held in reversed(tuple(_HELD)):

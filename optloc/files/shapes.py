@@ -34,6 +34,7 @@ from optloc.files.table_import import (
     Named,
     Readings,
     in_unit,
+    name_of_stations,
     sort_named,
     stated_sigma,
     unit_for,
@@ -333,7 +334,7 @@ def _checked(
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
             if name not in known:
-                where = hints.stations.name if hints.stations is not None else table.source
+                where = table.source if hints.stations is None else name_of_stations(hints)
                 column = roles.find("station") if len(found.columns) == 1 else None
                 item = int(np.flatnonzero(end == name)[0])
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
