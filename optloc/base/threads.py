@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from time import perf_counter
 from typing import TypeVar
@@ -47,6 +48,16 @@ def thread_count() -> int:
     if not given.isdecimal() or int(given) < 1:
         raise InvalidProblem(f"{given!r} is not a number of threads", _VARIABLE, "give a whole number of at least 1")
     return int(given)
+
+
+@contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """Use at most `count` threads for batches within the block, instead of all processors."""
+    token = _SHARE.set(count)
+    try:
+        yield
+    finally:
+        _SHARE.reset(token)
 
 
 def map_on_threads(

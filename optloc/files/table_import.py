@@ -25,6 +25,10 @@ from optloc.files.wave_speed import WaveOptions
 from optloc.models import MODELS, kind_named
 
 
+class NoReading(InvalidProblem):
+    """A table whose readings are all missing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Form:
     """A sort of readings in tables.
@@ -531,7 +535,7 @@ def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table
     for number in (found.values.number(mark) for mark in marks):
         is_missing |= False if number is None else found.values.units == number
     if is_missing.all():
-        raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
+        raise NoReading("no cell has a reading", table.source, "check --missing and the columns")
     count = int(is_missing.sum())
     notes = (
         [f"{_cells(count)} with {hints.missing}: no reading; use --missing none if they are readings"] if count else []
