@@ -29,10 +29,11 @@ def dask_client(address: str | None, jobs: int) -> Iterator[Any]:
     Raises
     ------
     InvalidProblem
-        If Dask is not installed, the scheduler cannot be reached, or it has no workers.
+        If Dask is not installed, the scheduler cannot be reached, or it has no workers; also if it ends in the block.
     """
     try:
-        from distributed import Client, LocalCluster
+        from distributed import CancelledError, Client, LocalCluster
+        from distributed.comm import CommClosedError
     except ImportError:
         raise InvalidProblem("Dask is not installed", "--executor", "pip install 'optloc[dask]'") from None
     with ExitStack() as stack:
@@ -50,7 +51,11 @@ def dask_client(address: str | None, jobs: int) -> Iterator[Any]:
         if not count:
             advice = "start one: dask worker ADDRESS --nthreads 1"
             raise InvalidProblem("the scheduler has no workers", address or "dask", advice)
-        yield client
+        try:
+            yield client
+        except (CancelledError, CommClosedError):
+            advice = "start it again, and run the same command: finished parts are kept"
+            raise InvalidProblem("the scheduler has ended", address or "dask", advice) from None
 
 
 @contextmanager

@@ -90,8 +90,7 @@ def run_on_one_thread(work: Callable[[Task], Result], task: Task) -> Result:
 def _run_on_dask(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
     """Yield the results of tasks on a Dask cluster, which starts tasks of lost workers again."""
     with dask_client(by.address, by.jobs or thread_count()) as client:
-        from distributed import CancelledError, KilledWorker, as_completed
-        from distributed.comm import CommClosedError
+        from distributed import KilledWorker, as_completed
 
         waiting, running, completed = iter(tasks), dict[Any, Task](), as_completed()
         suspects = list[Task]()
@@ -106,25 +105,21 @@ def _run_on_dask(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequen
                 running[future] = task
                 completed.add(future)
 
-        try:
-            hand_out(_AHEAD * sum(client.ncores().values()))
-            for future in completed:
-                task = running.pop(future)
-                hand_out(1)
-                try:
-                    yield task, future.result()
-                except KilledWorker:
-                    suspects.append(task)
-                future.release()
-            # Dask also blames the tasks that waited at a lost worker, so each suspect is tried again alone.
-            for task in suspects:
-                try:
-                    yield task, submit(task).result()
-                except KilledWorker:
-                    yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
-        except (CancelledError, CommClosedError, OSError, TimeoutError):
-            advice = "start it again, and run the same command: finished partitions are kept"
-            raise InvalidProblem("the scheduler has ended", by.address or "dask", advice) from None
+        hand_out(_AHEAD * sum(client.ncores().values()))
+        for future in completed:
+            task = running.pop(future)
+            hand_out(1)
+            try:
+                yield task, future.result()
+            except KilledWorker:
+                suspects.append(task)
+            future.release()
+        # Dask also blames the tasks that waited at a lost worker, so each suspect is tried again alone.
+        for task in suspects:
+            try:
+                yield task, submit(task).result()
+            except KilledWorker:
+                yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
 
 
 def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:

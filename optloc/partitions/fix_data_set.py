@@ -213,9 +213,9 @@ def _check_events(index: EventIndex, one: FinishedPartition, events: Array, out:
         common = sorted(set(_events(out, one.name)) & set(_events(out, other)))
         if common:
             first, second = sorted((one.name, other))
-            what = f"the event {common[0][0]!r} is in two partitions, {first} and {second}"
+            what = f"the event {common[0][0]!r} is in both partitions"
             advice = "write all readings of an event to one file, or join columns: --column message=day+id"
-            raise InvalidProblem(what, None, advice)
+            raise InvalidProblem(what, f"{first} and {second}", advice)
 
 
 def _identity(options: FixOptions) -> dict[str, Any]:

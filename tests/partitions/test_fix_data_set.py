@@ -96,7 +96,7 @@ def test_an_event_in_two_partitions_is_named_with_both_files(tmp_path, stopped):
     if stopped:
         fix_data_set(folder, tmp_path / "out", options_of(sites), HERE)
     pd.concat([later, shared.iloc[:4]]).to_parquet(folder / "part-2.parquet", index=False)
-    text = r"the event '7' is in two partitions, part-0\.parquet and part-2\.parquet; write all readings"
+    text = r"part-0\.parquet and part-2\.parquet: the event '7' is in both partitions; write all readings"
     with pytest.raises(InvalidProblem, match=text):
         fix_data_set(folder, tmp_path / "out", options_of(sites), HERE)
 
