@@ -29,7 +29,7 @@ PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).p
 # Pages that take seconds.
 LONG = (
     *("recipes", "tutorials", "studies.md", "details/studies.md", "placement.md", "details/placement.md", "maps.md"),
-    *("details/constraints.md", "howto/layers.md", "optimisation.md"),
+    *("details/constraints.md", "howto/layers.md", "howto/scale.md", "optimisation.md"),
 )
 RUN = [
     pytest.param(page, marks=pytest.mark.slow) if page.relative_to(DOCS).as_posix().startswith(LONG) else page

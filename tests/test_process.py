@@ -2,6 +2,7 @@
 
 import copy
 import multiprocessing
+import os
 import pickle
 import subprocess
 import sys
@@ -177,3 +178,52 @@ def test_problems_and_fixes_are_copied_whole(name, copied):
     assert again.structure == problem.structure
     assert same(solve(again, "auto"), fix)
     assert same(copied(fix), fix)
+
+
+# A program whose threads solve from the first moment, also while their modules are imported, and which forks 50 times.
+# Each child solves. A child that does not end within a minute is killed and reported.
+FORKING = """
+import os, signal, sys, threading, time
+import numpy as np
+import optloc
+
+stations = {"A": (0.0, 0.0), "B": (8e3, 0.0), "C": (0.0, 6e3), "D": (8e3, 6e3), "E": (4e3, 9e3)}
+place = np.array(list(stations.values()))
+
+def ranges(seed, count):
+    rng = np.random.default_rng(seed)
+    return np.linalg.norm(place - rng.uniform(0.0, 6e3, 2), axis=1) + rng.normal(0.0, 5.0, (count, 5))
+
+stop = threading.Event()
+
+def work(number):
+    seed = 1000 * number
+    while not stop.is_set():
+        seed += 1
+        method = ("auto", "gtrs+lsr", "huber")[seed % 3]
+        optloc.locate(stations, ranges=ranges(seed, 1 + seed % 40), sigma=5.0, method=method)
+
+threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+for thread in threads:
+    thread.start()
+lost = 0
+for seed in range(50):
+    time.sleep(0.02)
+    child = os.fork()
+    if not child:
+        signal.alarm(60)
+        fix = optloc.locate(stations, ranges=ranges(seed, 1)[0], sigma=5.0)
+        os._exit(0 if fix.answered else 1)
+    lost += os.waitpid(child, 0)[1] != 0
+stop.set()
+for thread in threads:
+    thread.join()
+sys.exit(min(lost, 100))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+@pytest.mark.slow
+def test_fifty_forks_among_solving_threads_end():
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", FORKING], timeout=600, check=False)
+    assert done.returncode == 0

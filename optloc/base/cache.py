@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 
-from optloc.base.threads import held_by_forks
+from optloc.base.forks import held_by_forks
 
 Value = TypeVar("Value")
 

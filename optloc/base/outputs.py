@@ -7,6 +7,7 @@ ever has the final name: after a full disk or Ctrl-C the old file is still there
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import stat
 import sys
@@ -47,8 +48,20 @@ def unwritable(path: Path, error: OSError) -> InvalidProblem:
     return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")
 
 
+# An address such as s3://bucket/key; the class Path joins its slashes. A drive of Windows has a single letter.
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+
+
+def refuse_address(path: Path) -> None:
+    """Raise InvalidProblem if a path is an address of an object store, such as ``s3://bucket/key``."""
+    if _ADDRESS.match(str(path)):
+        advice = "copy the data to a folder, or read and write them with Dask or Ray and optloc.fix_table"
+        raise InvalidProblem("this is an address of an object store, not a file or folder", str(path), advice)
+
+
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents; raise InvalidProblem if the system refuses."""
+    """Make a folder and its parents; raise InvalidProblem if the system refuses, or for an address."""
+    refuse_address(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -104,6 +117,7 @@ def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
 
     `inputs` are files that must not be replaced.
     """
+    refuse_address(path)
     try:
         place = Path(os.path.realpath(path))
         if place.name != place.name.encode(errors="replace").decode():

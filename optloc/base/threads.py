@@ -6,8 +6,8 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from threading import Lock as LockType
 from time import perf_counter
 from typing import TypeVar
 
@@ -50,26 +50,14 @@ def thread_count() -> int:
     return int(given)
 
 
-def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
-    """Register a lock so that it is free in a forked child, and return it. A fork first acquires the lock.
-
-    Without it, a child that forks while another thread holds the lock could wait without end.
-
-    Parameters
-    ----------
-    lock : threading.Lock
-        A lock that lives as long as the process.
-    begin : callable
-        Function that the child calls first.
-    """
-
-    def child() -> None:
-        lock.release()
-        begin()
-
-    if hasattr(os, "register_at_fork"):  # not where processes do not fork
-        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=child)
-    return lock
+@contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """Use at most `count` threads for batches within the block, instead of all processors."""
+    token = _SHARE.set(count)
+    try:
+        yield
+    finally:
+        _SHARE.reset(token)
 
 
 def map_on_threads(

@@ -21,6 +21,9 @@ from optloc.cli.options import (
     Budget,
     CommandGroup,
     Constraint,
+    DataSetExecutor,
+    DataSetJobs,
+    DataSetScheduler,
     EmitterCount,
     Explain,
     FalseRows,
@@ -54,7 +57,9 @@ from optloc.cli.options import (
     constraints,
     example,
     find_problem,
+    is_data_set,
     name_in,
+    refuse_options,
     run_process,
 )
 
@@ -126,6 +131,7 @@ def _options(
         "optloc fix site.toml --height '1640 ft'",
         "optloc fix site.toml --constraint 'keep-out-disc lat=47.1 lon=8.2 radius=1 km'",
         "optloc fix toa.csv --stations sites.csv --sigma '20 ns'",
+        "optloc fix arrivals --out fixes --stations sites.csv --sigma '20 ns' --executor dask",
     ),
 )
 @takes_table
@@ -146,6 +152,9 @@ def fix(
     late: LateFromData = False,
     explain: Explain = False,
     allow: Allow = None,
+    executor: DataSetExecutor = None,
+    scheduler: DataSetScheduler = None,
+    jobs: DataSetJobs = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
@@ -153,19 +162,31 @@ def fix(
     verbose: Verbose = False,
     given: Any = None,
 ) -> None:
-    """Fix the target of a problem file or of a measurement table, at each epoch.
+    """Fix the target of a problem file, of a measurement table or of a data set, at each epoch.
 
-    Options such as --height add to the constraints of the file. A table needs --stations and --sigma.
+    Options such as --height add to the constraints of the file. A table needs --stations and --sigma. A data set is a
+    folder of Parquet tables; its fixes are written to the folder --out, and a stopped run continues.
     """
+    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
+    files = {"geojson_path": geojson, "plot": plot, "html": html}
+    estimated = {"noise_from_data": noise, "rescale_noise": rescale, "late_from_data": late, "explain": explain}
+    clusters = {"executor": executor, "scheduler": scheduler, "jobs": jobs}
+    if is_data_set(file):
+        from optloc.cli.data_set import executor_of, run_data_set
+
+        refuse_options({"geojson": geojson, "plot": plot, "html": html, **estimated}, "a data set does not use it")
+        by = executor_of(executor, scheduler, jobs)
+        common = {"as_json": as_json, "quiet": quiet, "allow": passing}
+        raise typer.Exit(run_data_set(file, out, method, more, given, by, **common))
+    refuse_options(clusters, "it is for data sets, which are folders of Parquet files")
     from optloc.cli.fix import run_fix
 
-    more, passing = constraints(height, above_ground, box, constraint or ()), allowed(allow)
-    files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
         file,
         method,
         more,
         as_json=as_json,
+        out=out,
         **files,
         quiet=quiet,
         noise=noise,

@@ -17,11 +17,12 @@ from rich.table import Table
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import replace_together
 from optloc.base.types import Array, Bias, Stations
-from optloc.cli.file_fixes import fix_epochs, table_json
+from optloc.cli.file_fixes import table_json
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
     Screen,
+    bar,
     claim_outputs,
     dumps,
     say_all,
@@ -39,6 +40,7 @@ from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.plausibility import CHECKS
 from optloc.models import MODELS
+from optloc.partitions.epoch_fixes import fix_epochs
 from optloc.problem.epoch_groups import explanations_by_epoch
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
@@ -351,7 +353,8 @@ def _fix(loaded: Loaded, batch: Problem, method: str, quiet: bool) -> Fix:
         from optloc.solvers import solve
 
         return solve(batch, method)
-    fix, _ = fix_epochs(replace(loaded, problem=problem), method, quiet)
+    with bar(loaded.title, problem.epochs, quiet) as advance:
+        fix, _ = fix_epochs(replace(loaded, problem=problem), method, advance)
     if fix.explanations is None:
         return fix
     return replace(fix, explanations=explanations_by_epoch(problem, fix.explanations))

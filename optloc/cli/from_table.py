@@ -303,10 +303,9 @@ def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptio
     `given` has the values of the table options. Raise InvalidProblem for a problem file with options of tables.
     """
     from optloc.files.csv_formats import is_log
-    from optloc.files.table_import import ColumnHints
 
     if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()) or is_log(file):
-        return ColumnHints(**given)
+        return hints_of_options(given)
     wave: WaveOptions | None = given.get("wave")
     stated = [name for name, value in given.items() if value and name != "wave"]
     if stated:
@@ -316,6 +315,13 @@ def table_hints(file: Path, given: Mapping[str, Any]) -> ColumnHints | WaveOptio
             what, flag, "write the setting in the file, or name a table with the ending .csv, .json or .parquet"
         )
     return wave
+
+
+def hints_of_options(given: Mapping[str, Any]) -> ColumnHints:
+    """Return the column hints of the values of the table options, `given`."""
+    from optloc.files.table_import import ColumnHints
+
+    return ColumnHints(**given)
 
 
 def read_problem(

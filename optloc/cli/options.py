@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
 from importlib.resources import files
 from io import TextIOWrapper
@@ -21,7 +21,7 @@ from typer.core import TyperGroup
 
 from optloc.base.errors import InvalidProblem, nearest, status_named
 from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax_budget
-from optloc.base.outputs import remove_unnamed, replace_files, visible
+from optloc.base.outputs import refuse_address, remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
 from optloc.cli.completion import choices, complete, stages, statuses
@@ -443,6 +443,54 @@ def constraints(
         place = "--constraint" if len(texts) == 1 else f"--constraint {i + 1}"
         found[place] = constraint_of_text(text, place)
     return found
+
+
+# Data sets.
+
+_DATA_SETS = "Data sets"
+DataSetExecutor = Annotated[
+    str | None,
+    typer.Option(
+        "--executor",
+        "-x",
+        metavar="NAME",
+        help="Where the partitions of a data set are fixed: local (this process), dask or ray.",
+        rich_help_panel=_DATA_SETS,
+    ),
+]
+DataSetScheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Running cluster, such as tcp://host:8786; implies dask.",
+        rich_help_panel=_DATA_SETS,
+    ),
+]
+DataSetJobs = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        max=1024,  # a larger number is a typing error
+        help="Processes of a local cluster; all processors by default.",
+        rich_help_panel=_DATA_SETS,
+    ),
+]
+
+
+def is_data_set(path: Path) -> bool:
+    """Return whether a path is a folder, or an address of an object store, whose error names data sets."""
+    refuse_address(path)
+    return path.is_dir()
+
+
+def refuse_options(given: Mapping[str, Any], why: str) -> None:
+    """Raise InvalidProblem for the first option with a value; `given` has values by name, and `why` is the reason."""
+    stated = next((name for name, value in given.items() if value), None)
+    if stated is not None:
+        raise InvalidProblem(f"this option has no use here: {why}", f"--{stated.replace('_', '-')}", "remove it")
 
 
 # Station placement.

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         claim as claim,
         is_stream as is_stream,
         make_folder as make_folder,
+        refuse_address as refuse_address,
         replace_together as replace_together,
         visible as visible,
         write_text as write_text,

@@ -178,17 +178,19 @@ _PLAIN = r"^-?([0-9]+(\.[0-9]*)?|\.[0-9]+)$"
 
 
 def _plain_numbers(column: Array) -> NumberColumn | None:
-    """Return a text column with plain numbers of at most 64 bits; None for other columns.
+    """Return a column of whole numbers, or of text with plain numbers of at most 64 bits; None for other columns.
 
     This function is fast; other columns are read cell by cell.
     """
     import pyarrow as pa
     from pyarrow import compute as pc
 
-    if column.dtype != object:
+    # Arrow and Python write floats in different forms, so floats are read cell by cell.
+    if column.dtype not in (np.object_, np.int64):
         return None
     try:
-        text = pc.utf8_trim_whitespace(pa.array(column, pa.string()))
+        given = pa.array(column, pa.string()) if column.dtype == object else pc.cast(pa.array(column), pa.string())
+        text = pc.utf8_trim_whitespace(given)
     except (pa.ArrowException, UnicodeEncodeError):
         return None
     nothing = pc.or_kleene(pc.is_null(text), pc.is_in(pc.utf8_lower(text), pa.array(sorted(NOTHING))))

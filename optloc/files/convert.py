@@ -35,6 +35,7 @@ from optloc.files.reading_report import check_receivers, reading_lines, unused_c
 from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
 from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
+from optloc.files.table import Table
 from optloc.files.table_import import (
     CONVENTIONS,
     ColumnHints,
@@ -101,8 +102,9 @@ def convert(
     """
     hints = replace(hints or ColumnHints(), **options)
     _check_hints(hints)
-    claim(out, inputs=[source, *(path for path in (hints.stations, hints.times) if path)])
+    claim(out, inputs=[source, *(path for path in (hints.stations, hints.times) if isinstance(path, Path))])
     if hints.times is not None or source.suffix.lower() in _ORBITS:
+        assert not isinstance(hints.stations, Table)
         return write_satellites(source, out, hints.columns, hints.times, hints.stations)
     if hints.what == "stations" or source.suffix.lower() == ".geojson":
         return _write_stations(source, out, hints.columns, hints.frame)
@@ -110,7 +112,7 @@ def convert(
         raise InvalidProblem("the name of a problem file must end in .toml", str(out), "change the name after --out")
     table_problem = interpret_table(source, hints)
     tell(table_problem)
-    claim(*table_problem.tables(out), inputs=[source, *(path for path in (hints.stations,) if path)])
+    claim(*table_problem.tables(out), inputs=[source, *(path for path in (hints.stations,) if isinstance(path, Path))])
     # Read before writing, so that an invalid problem is not written.
     loaded = table_problem.read()
     return Converted(table_problem.write(out), loaded, table_problem.notes, table_problem.as_read)
@@ -174,8 +176,10 @@ def _sort(word: str) -> str:
     return "arrivals" if kind == "toa" else kind
 
 
-def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
+def interpret_table(source: Path, hints: ColumnHints, table: Table | None = None) -> TableProblem:
     """Return the problem of a table of readings or pseudoranges; `hints` has the facts that the table does not contain.
+
+    The table is read from the file `source`, unless it is given as `table`.
 
     Raises
     ------
@@ -183,7 +187,10 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
         For errors, and for ambiguous content; then the message names the option that decides.
     """
     _check_hints(hints)
-    table_problem = gnss(source, hints) if is_gnss(source) else _of_table(source, hints)
+    if table is None and is_gnss(source):
+        table_problem = gnss(source, hints)
+    else:
+        table_problem = _of_table(source, hints, read_table(source) if table is None else table)
     azimuths = any(section.kind == "azimuth" for section in table_problem.sections)
     if hints.declination is not None and not azimuths:
         raise InvalidProblem("the table has no bearings", "--declination", "remove this option")
@@ -193,13 +200,13 @@ def interpret_table(source: Path, hints: ColumnHints) -> TableProblem:
     return with_wave(replace(table_problem, height=stated), hints.wave)
 
 
-def _of_table(source: Path, hints: ColumnHints) -> TableProblem:
+def _of_table(source: Path, hints: ColumnHints, table: Table) -> TableProblem:
     """Return the problem of a measurement table.
 
     The table has pseudoranges with satellites, or columns that are named after stations, or one reading in each row.
     Raise InvalidProblem if its content or the positions of its stations are unknown.
     """
-    table = without_ignored_columns(read_table(source), hints.ignore)
+    table = without_ignored_columns(table, hints.ignore)
     stated_columns = {role: name for role, name in hints.columns.items() if hints.stations is None or role not in PLACE}
     roles = Roles.of(table, stated_columns)
     # Arrivals with the name and position of a satellite in each row are pseudoranges.
@@ -357,7 +364,8 @@ def _plan(
         *([("waves", speeds)] if speeds else []),
         *([("not used", ", ".join(rest))] if rest else []),
     ]
-    return TableProblem(source, sections, stations, tuple(read), tuple(notes), lines, after, height, uses, frame)
+    found_text = tuple(read), tuple(notes)
+    return TableProblem(source, sections, stations, *found_text, lines, after, height, uses, frame, epochs)
 
 
 def _check_unit(hints: ColumnHints, found: Sequence[Readings]) -> None:

@@ -25,6 +25,7 @@ from optloc.files.table_import import (
     ColumnHints,
     Named,
     Readings,
+    name_of_stations,
     quoted,
     sort_named,
     unused_measurement,
@@ -146,7 +147,7 @@ def reading_lines(
         out.append(("epochs", f"{each} by column {roles.find('time')}"))
     if "target" in epochs:
         out.append(("targets", f"{len(numbered(epochs['target'])[0])} by column {roles.find('target')}"))
-    where = hints.stations.name if hints.stations is not None else "the table itself"
+    where = "the table itself" if hints.stations is None else name_of_stations(hints)
     axes = (
         "latitude and longitude" if stations.frame == "geodetic" else f"x and y, {stations.frame}, in {stations.unit}"
     )

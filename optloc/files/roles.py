@@ -343,18 +343,23 @@ class ColumnPlaces:
         return [str(name) for name in self.columns["name"]]
 
 
-def places_of(path: Path, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
-    """Return the stations of a file; `stated` has the stated columns by role, and `frame` applies to x, y, z."""
+def places_of(path: Path | Table, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
+    """Return the stations of a file or table; `stated` has columns by role, and `frame` applies to x, y, z."""
+    if isinstance(path, Table):
+        return _of_table(path, stated, frame)
     if path.suffix.lower() == ".geojson":
         return _of_geojson(json_of(read_text(path), path.name), path.name)
     if path.suffix.lower() == ".json":
         data = json_of(read_text(path), path.name)
         if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
             return _of_geojson(data, path.name)
-        roles = Roles.of(records(data, path.name), stated)
-    else:
-        roles = Roles.of(read_table(path), stated)
-    roles, note = _with_names(roles)
+        return _of_table(records(data, path.name), stated, frame)
+    return _of_table(read_table(path), stated, frame)
+
+
+def _of_table(table: Table, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
+    """Return the stations of a table; arguments as for `places_of`."""
+    roles, note = _with_names(Roles.of(table, stated))
     found = _noted(placed(roles, frame), note)
     column = roles.find("heading")
     if column is not None:

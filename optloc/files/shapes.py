@@ -32,8 +32,10 @@ from optloc.files.table_import import (
     ColumnHints,
     Form,
     Named,
+    NoReading,
     Readings,
     in_unit,
+    name_of_stations,
     sort_named,
     stated_sigma,
     unit_for,
@@ -106,7 +108,7 @@ def _wide_sort(
             deviations.append(sigma_of(table, sigma_name, form, first, cells.row))
             errors_used.append(sigma_name)
     if not any(map(len, values)):
-        raise InvalidProblem("no cell has a reading", table.source, "check the columns of the receivers")
+        raise NoReading("no cell has a reading", table.source, "check the columns of the receivers")
     pairs = form.stations > 1
     # The name A-B, or one station and a stated reference, determine the sign: positive if the first is farther.
     minus = all(one.minus or len(one.ends) == 1 for one in columns)
@@ -253,7 +255,7 @@ def read_long(
     unit, note = ("s", "") if dated else unit_for(column, form, hints, cells.values, table.source)
     pick = cells.row
     if not len(pick):
-        raise InvalidProblem("no cell has a reading", table.where(column), "check the column")
+        raise NoReading("no cell has a reading", table.where(column), "check the column")
     a = roles.labels("station") if receivers is None else receivers
     found = _of_column(form, unit, cells, column, a)
     hints, why = _with_reference(found, roles, hints, stations)
@@ -333,7 +335,7 @@ def _checked(
     for end in (found.a, found.b):
         for name in [] if end is None else numbered(end)[0]:
             if name not in known:
-                where = hints.stations.name if hints.stations is not None else table.source
+                where = table.source if hints.stations is None else name_of_stations(hints)
                 column = roles.find("station") if len(found.columns) == 1 else None
                 item = int(np.flatnonzero(end == name)[0])
                 spot = found.where(table, item) if column is None else table.where(column, int(found.row[item]))
@@ -413,6 +415,25 @@ def _with_convention(found: Readings, hints: ColumnHints, stations: ColumnPlaces
     return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
 
 
+def events_of_rows(roles: Roles, hints: ColumnHints) -> dict[str, Array]:
+    """Return the columns epoch, time and target (n,) of the rows of a table without any reading, as `epochs_of`."""
+    out = {"target": roles.labels("target")} if roles.find("target") is not None else {}
+    if roles.find("message") is not None:
+        out["epoch"] = roles.labels("message")
+    name = roles.find("time")
+    time = None if name is None else column_times(roles, name, hints.zone, hints.time_unit)
+    if time is not None:
+        out["time"] = time
+    elif name is not None and "epoch" not in out:
+        out["epoch"] = roles.labels("time")
+    return out if out.keys() & {"epoch", "time"} else out | {"epoch": _row_numbers(roles.table)}
+
+
+def _row_numbers(table: Table) -> Array:
+    """Return the numbers of the rows of a table as text (n,), from 1."""
+    return np.array([str(row + 1) for row in range(table.count)], dtype=object)
+
+
 def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> dict[str, Array]:
     """Return the available columns epoch, time and target (n,) of the rows of a table, by these names.
 
@@ -452,7 +473,7 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
         out["epoch"] = roles.labels("time")
     # Without labels and times, each row of a wide table is an epoch.
     if not long and not out.keys() & {"epoch", "time"}:
-        out["epoch"] = np.array([str(row + 1) for row in range(table.count)], dtype=object)
+        out["epoch"] = _row_numbers(table)
     return out
 
 

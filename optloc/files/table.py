@@ -341,6 +341,21 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
     return Table(path.name, columns, read.num_rows if columns else about.metadata.num_rows, names, others=others)
 
 
+def of_arrow(read: Any, source: str) -> Table:
+    """Return a table of pyarrow as the reader of a Parquet file returns it; `source` is its name for messages."""
+    import pyarrow as pa
+
+    check_once(read.schema.names, _REPEATED_COLUMN, source)
+    kinds = {entry.name: entry.type for entry in read.schema}
+    text = {name for name, kind in kinds.items() if pa.types.is_string(kind) or pa.types.is_large_string(kind)}
+    columns = {}
+    for name in (name for name, kind in kinds.items() if _fits(pa, kind)):
+        column = read.column(name)
+        columns[name] = _column_of(pa, column.dictionary_encode() if name in text else column)
+    others = {name: str(kind) for name, kind in kinds.items() if name not in columns}
+    return Table(source, columns, read.num_rows, {}, others=others)
+
+
 def _check_size(about: Any, schema: Any, source: str) -> None:
     """Raise InvalidProblem if a Parquet file declares sizes beyond the budget, or sizes that contradict each other.
 

@@ -25,6 +25,10 @@ from optloc.files.wave_speed import WaveOptions
 from optloc.models import MODELS, kind_named
 
 
+class NoReading(InvalidProblem):
+    """A table whose readings are all missing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Form:
     """A sort of readings in tables.
@@ -90,8 +94,9 @@ class ColumnHints:
 
     Parameters
     ----------
-    stations : Path, optional
-        File of station positions: CSV, Parquet, JSON or GeoJSON. With orbits: the fixed stations.
+    stations : Path or Table, optional
+        Station positions: a file (CSV, Parquet, JSON or GeoJSON) or its table. With orbits: the file of the fixed
+        stations.
     sigma : str, optional
         Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; for
         several kinds "range=10 cm,azimuth=2 deg".
@@ -145,7 +150,7 @@ class ColumnHints:
         Known height of the target for `convert`, such as "1.2 m"; several heights are separated by commas.
     """
 
-    stations: Path | None = None
+    stations: Path | Table | None = None
     sigma: str | None = None
     what: str | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -171,6 +176,12 @@ class ColumnHints:
     turned: bool = False
     wave: WaveOptions = field(default_factory=WaveOptions)
     height: str | None = None
+
+
+def name_of_stations(hints: ColumnHints) -> str:
+    """Return the name of the file or table of the stations, for messages; empty without one."""
+    given = hints.stations
+    return given.source if isinstance(given, Table) else "" if given is None else given.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -524,7 +535,7 @@ def without_gaps(found: Readings, epoch: Array, hints: ColumnHints, table: Table
     for number in (found.values.number(mark) for mark in marks):
         is_missing |= False if number is None else found.values.units == number
     if is_missing.all():
-        raise InvalidProblem("no cell has a reading", table.source, "check --missing and the columns")
+        raise NoReading("no cell has a reading", table.source, "check --missing and the columns")
     count = int(is_missing.sum())
     notes = (
         [f"{_cells(count)} with {hints.missing}: no reading; use --missing none if they are readings"] if count else []

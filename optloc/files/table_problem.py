@@ -79,6 +79,8 @@ class TableProblem:
         Role of each used column.
     frame : tuple of str
         Lines of the frame; empty for the frame of the stations.
+    events : mapping of str to array (n,)
+        Columns epoch, time and target of all n rows of the table, also of rows without a reading.
     """
 
     source: Path
@@ -91,6 +93,7 @@ class TableProblem:
     height: str = ""
     uses: Mapping[str, str] = field(default_factory=dict)
     frame: tuple[str, ...] = ()
+    events: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def as_read(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -321,6 +321,14 @@ def _lock_file(file: IO[bytes], *, wait: bool) -> bool:
     return True
 
 
+def _unlock_file(file: IO[bytes]) -> None:
+    """Unlock a file; nothing happens where the system or file system has no locks."""
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
 @contextmanager
 def sole_compiler() -> Iterator[bool]:
     """Yield True and lock the compilation of all machine code, or yield False if another process has the lock."""
@@ -349,4 +357,8 @@ def locked(kernel: Compilable) -> Iterator[None]:
             yield
             return
         _lock_file(file, wait=True)
-        yield
+        try:
+            yield
+        finally:
+            # Closing is not enough: a process that was forked meanwhile shares the open file, and would keep the lock.
+            _unlock_file(file)

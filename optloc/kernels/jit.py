@@ -13,7 +13,7 @@ from types import FunctionType
 from typing import Any, TypeAlias, TypeVar, cast
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.threads import held_by_forks
+from optloc.base.forks import held_by_forks
 from optloc.base.types import Array
 from optloc.kernels.code_cache import code_cache_of, folder, is_cached, locked, name_of, start_background_compiler
 from optloc.kernels.compilation import options

@@ -15,7 +15,7 @@ from threading import Lock, Thread
 from time import monotonic, sleep
 from typing import ClassVar
 
-from optloc.base.threads import held_by_forks
+from optloc.base.forks import held_by_forks
 
 # Seconds between two lines, so that a user does not wait without any output; seconds between two checks of the clock;
 # longest pause between two compilations that count as one activity.

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
+from optloc.base.cached import cached_property
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Band, Rows
 from optloc.base.units import SPEED_OF_LIGHT

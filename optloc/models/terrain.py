@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
+from optloc.base.cached import cached_property
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.models.primitives import Jet, differential, namespace

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from optloc.base import arrays, linalg
+from optloc.base.cached import cached_property
 from optloc.base.types import Array
 
 

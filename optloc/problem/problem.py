@@ -7,12 +7,12 @@ batch axes. An array without batch axes is shared by all problems of the batch.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.arrays import as_array_like, library
+from optloc.base.cached import cached_property
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.plots import plot_of

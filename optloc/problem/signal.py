@@ -26,10 +26,10 @@ Signals" (2005), appendix B (information of Gaussian data).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from optloc.base.cached import cached_property
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT

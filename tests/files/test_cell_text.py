@@ -73,3 +73,11 @@ def test_distinct_is_unique():
 )
 def test_times_become_dates_with_the_fewest_decimals(seconds, texts):
     assert date_texts(np.array(seconds)).tolist() == texts
+
+
+def test_whole_numbers_keep_their_digits_and_their_limits():
+    values = [1790000000000014221, 0, -5, 2**63 - 1]
+    found = numbers(Table("t", {"z": np.array(values)}, len(values)), "z")
+    assert [int(value) for value in found.values.tolist()] == values
+    assert found.row.tolist() == [0, 1, 2, 3]
+    assert not found.values.written.any()

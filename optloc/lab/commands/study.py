@@ -146,6 +146,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of the report; report in the study's folder by default.")
     ] = None,
+    outside: Outside = False,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -263,6 +264,7 @@ def profiles(
     plot: Annotated[
         Path | None, typer.Option(metavar="OUT", help="Picture of both profiles: .png, .svg or .pdf.")
     ] = None,
+    outside: Outside = False,
     as_json: Json = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -271,14 +273,15 @@ def profiles(
     """Print data and performance profiles: the share of trials that each method solves within a given work."""
     from optloc.cli import claim_outputs, write_picture
     from optloc.lab.study import summary
-    from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest, references
+    from optloc.lab.study.folder import read_frame, read_manifest, references
+    from optloc.lab.study.problem_copies import design_of_manifest
     from optloc.lab.study.profiles import profiles as profiled
 
     claim_outputs(picture=plot)
     frame = read_frame(folder, summary.COLUMNS)
     if not len(frame):
         raise InvalidProblem("the study has no finished part yet", str(folder), "run the study")
-    known = references(design_of_manifest(read_manifest(folder)))
+    known = references(design_of_manifest(read_manifest(folder), folder))
     found = profiled(frame, tau=tau, work=work, out=known)
     if plot is not None:
         from optloc.lab.report.figures import profile_picture
@@ -319,6 +322,7 @@ def histories(
     ] = 1e-3,
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Table of all points: .csv or .parquet.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="OUT", help="Picture: .png, .svg or .pdf.")] = None,
+    outside: Outside = False,
     as_json: Json = False,
     force: Force = False,
     quiet: Quiet = False,

@@ -20,8 +20,9 @@ from optloc.lab.report import figures as drawn
 from optloc.lab.report.sheets import latex, sheets
 from optloc.lab.study import summary
 from optloc.lab.study.design import StudyDesign
-from optloc.lab.study.folder import StudyManifest, design_of_manifest, read_frame, read_manifest, references
+from optloc.lab.study.folder import StudyManifest, read_frame, read_manifest, references
 from optloc.lab.study.networks import NetworkCase
+from optloc.lab.study.problem_copies import design_of_manifest
 from optloc.lab.study.profiles import Profiles, profiles
 from optloc.lab.study.simulation import Case, draw
 from optloc.lab.study.summary import case_label, noise_text
@@ -230,7 +231,7 @@ def _study_content(folder: Path) -> _StudyContent:
     frame = summary.judged(rows)
     # Best first: the order of tables, legends and colours.
     order, cells = summary.methods(frame), summary.cells(frame)
-    design = design_of_manifest(manifest)
+    design = design_of_manifest(manifest, folder)
     references_of_design = references(design)
     # Methods that know the truth are not ranked, unless the study has no others.
     rivals = frame[~frame["method"].isin(references_of_design)]

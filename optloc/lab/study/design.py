@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optloc.files import join, kind_model, parse_toml, read, read_text, validated, within
+from optloc.files import access, join, kind_model, parse_toml, read, read_text, validated, within
 from optloc.lab.study.document import Level, NetworkTable, ScenarioTable, StudyFile, sigma_of
 from optloc.lab.study.methods import StudyMethod, methods_of, version_of
 from optloc.lab.study.networks import NetworkCase, check_network, noise_of
@@ -133,12 +133,15 @@ class StudyDesign(HasShortForm):
         Every case with every method, in the order of the file.
     folder : str
         Folder of the problem files.
+    files : tuple of Path
+        The problem files and their tables, with links resolved.
     """
 
     study: StudyFile
     text: str
     cells: tuple[Cell, ...]
     folder: str = ""
+    files: tuple[Path, ...] = ()
 
     @property
     def chunks(self) -> Iterator[Chunk]:
@@ -239,8 +242,12 @@ def design_of_text(
         # Trials of the command line also replace the numbers of single scenarios.
         override = {} if trials is None else {"trials": None}
         cases: list[Case | NetworkCase] = []
-        for scenario in study.scenario:
-            cases += cases_of(scenario.model_copy(update=override), folder, study.seed, study.trials)
+        with access() as outer:
+            # An empty record, so that it has the files of this study only.
+            with access(outside=outer.outside, budget=outer.budget, anew=True) as found:
+                for scenario in study.scenario:
+                    cases += cases_of(scenario.model_copy(update=override), folder, study.seed, study.trials)
+            outer.read.update(found.read)
         for network in study.network:
             cases += network_cases(network.model_copy(update=override), study.seed, study.trials)
     except InvalidProblem as error:
@@ -256,9 +263,8 @@ def design_of_text(
     _check_names_differ([method.name for method in methods], source, "method")
     _check_names_differ([table.name for table in study.scenario], source, "scenario")
     _check_names_differ([table.name for table in study.network], source, "network")
-    return StudyDesign(
-        study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve())
-    )
+    cells = tuple(Cell(case, method) for case in cases for method in methods)
+    return StudyDesign(study, text, cells, str(folder.resolve()), tuple(sorted(found.read)))
 
 
 def _check_methods_fit(study: StudyFile, methods: list[StudyMethod]) -> None:

@@ -9,27 +9,23 @@ trial.
 
 from __future__ import annotations
 
-import logging
-import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import islice
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings, warn
 
 from optloc.lab.study.design import Chunk, StudyDesign, workers
 from optloc.lab.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
+from optloc.lab.study.problem_copies import store_problems
 from optloc.lab.study.trial import DIED, LATE, Lost, TrialPart, join_parts, part_of_lost
 from optloc.lab.study.worker_process import WorkerPool
+from optloc.partitions import dask_client, ray_cluster
 from optloc.problem import InvalidProblem, nearest, plugins
-
-CONNECT = 10.0
-"""Seconds to wait for a scheduler: one on the same network replies in less than one second."""
 
 TASK_LIMIT = 600.0
 """Default time limit of a task, seconds. A task should take seconds; the longest of the shipped studies takes half a
@@ -101,6 +97,7 @@ def run_design(
     with locked(folder):
         # The lock excludes other writers, so finished parts stay finished.
         manifest = begin(design, folder)
+        store_problems(design, folder)
         done = finished_parts(folder, manifest, say)
         known = known_data(design, folder, done)
         if tell is not None and done:
@@ -315,25 +312,9 @@ def _processes(by: Executor) -> Iterator[Begun]:
 @contextmanager
 def _dask(by: Executor) -> Iterator[Begun]:
     """Yield an executor on a Dask cluster; start a local cluster if there is no address."""
-    try:
-        from distributed import Client, KilledWorker, LocalCluster
-    except ImportError:
-        raise InvalidProblem("Dask is not installed", "--executor", "pip install 'optloc[dask]'") from None
-    with ExitStack() as stack:
-        try:
-            with _block_ctrl_c():
-                address: Any = by.address
-                if address is None:
-                    # Without a page of statistics, and without warnings about workers that end with the cluster.
-                    options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-                    address = stack.enter_context(LocalCluster(n_workers=by.jobs or workers(), **options))
-                client = stack.enter_context(Client(address, timeout=CONNECT))
-                count = sum(client.ncores().values())
-        except (OSError, TimeoutError, ValueError) as error:
-            raise _unreachable(by, error) from None
-        if not count:
-            advice = "start one: dask worker ADDRESS --nthreads 1"
-            raise InvalidProblem("the scheduler has no workers", by.address or "dask", advice)
+    with dask_client(by.address, by.jobs or workers()) as client:
+        from distributed import KilledWorker
+
         yield Begun(
             {"backend": "dask", "client": client, "n_jobs": -1},
             partial(compute_next_to_worker, plugins()),
@@ -342,53 +323,17 @@ def _dask(by: Executor) -> Iterator[Begun]:
 
 
 @contextmanager
-def _block_ctrl_c() -> Iterator[None]:
-    """Block Ctrl-C in all processes that start inside this context: only this process should receive Ctrl-C."""
-    if not hasattr(signal, "pthread_sigmask"):  # a system where Ctrl-C does not reach child processes
-        yield
-        return
-    resource_tracker.ensure_running()  # otherwise it would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
 def _ray(by: Executor) -> Iterator[Begun]:
     """Yield an executor on a Ray cluster; start a local cluster if there is no address."""
-    try:
-        import ray
+    with ray_cluster(by.address, by.jobs or workers()) as ray:
         from ray.util.joblib import register_ray
-    except ImportError:
-        raise InvalidProblem("Ray is not installed", "--executor", "pip install 'optloc[ray]'") from None
-    try:
-        ray.init(
-            address=by.address,
-            num_cpus=(by.jobs or workers()) if by.address is None else None,
-            include_dashboard=False if by.address is None else None,
-            log_to_driver=False,
-            logging_level="error",
-        )
-    except (OSError, ConnectionError, RuntimeError, ValueError) as error:
-        raise _unreachable(by, error) from None
-    try:
+
         register_ray()
         jobs = int(ray.cluster_resources().get("CPU", 1))
         deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
         yield Begun(
             {"backend": "ray", "n_jobs": jobs}, partial(compute_next_to_worker, plugins()), deaths, streams=False
         )
-    finally:
-        ray.shutdown()
-
-
-def _unreachable(by: Executor, error: BaseException) -> InvalidProblem:
-    """Return the error for a scheduler that does not reply, with the first line of `error`."""
-    first = (str(error) or type(error).__name__).splitlines()[0]
-    what = f"the scheduler cannot be reached ({first})"
-    return InvalidProblem(what, by.address or by.name, "start it, or check the address; finished parts are kept")
 
 
 @dataclass(frozen=True, slots=True)

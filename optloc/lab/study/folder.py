@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.files import json_of, read_bytes, written
+from optloc.files import json_of, read_bytes, refuse_address, within, written
 from optloc.lab.study.baselines import BASELINES
-from optloc.lab.study.design import StudyDesign, design_of_text, machine, versions
+from optloc.lab.study.design import StudyDesign, machine, versions
 from optloc.lab.study.methods import version_of
 from optloc.lab.study.trial import COLUMNS, FAILED, GAP, TrialPart, arrow_schema
 from optloc.problem import HasShortForm, InvalidProblem, Status
@@ -133,7 +133,7 @@ def read_manifest(folder: Path) -> StudyManifest:
     """Return the manifest of an output folder; raise InvalidProblem if there is no valid one."""
     from pydantic import TypeAdapter, ValidationError
 
-    path = folder / MANIFEST
+    path = within(folder, MANIFEST, str(folder / MANIFEST))
     if not path.exists():
         what = "the folder contains no study" if folder.is_dir() else "there is no such folder"
         raise InvalidProblem(what, str(folder), "name the folder that 'optloc study run' wrote")
@@ -148,14 +148,6 @@ def read_manifest(folder: Path) -> StudyManifest:
         return TypeAdapter(StudyManifest).validate_python(data)
     except ValidationError:
         raise InvalidProblem("the manifest is incomplete", str(path), "write to another folder") from None
-
-
-def design_of_manifest(manifest: StudyManifest) -> StudyDesign | None:
-    """Return the design of a study from its manifest; None if a problem file is missing or invalid."""
-    try:
-        return design_of_text(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
-    except InvalidProblem:
-        return None
 
 
 def references(design: StudyDesign | None) -> set[str]:
@@ -260,7 +252,8 @@ def part_files(folder: Path) -> dict[str, Path]:
     """Return the existing part files of a study by the keys of their chunks, sorted by name."""
     known = read_manifest(folder).chunks
     found = {path.name.partition(".")[0]: path for path in sorted((folder / "parts").glob("[!.]*.parquet"))}
-    return {key: path for key, path in found.items() if key in known}
+    # A folder of other people may contain links to other places.
+    return {key: within(folder, f"parts/{path.name}", str(path)) for key, path in found.items() if key in known}
 
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
@@ -380,6 +373,7 @@ def locked(folder: Path) -> Iterator[None]:
     InvalidProblem
         If another run has the lock, the folder cannot be written, or it contains other files than a study.
     """
+    refuse_address(folder)
     try:
         # Leave a folder with other files unchanged.
         if folder.is_dir() and not {MANIFEST, _LOCK} & (names := {path.name for path in folder.iterdir()}) and names:

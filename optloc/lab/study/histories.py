@@ -22,10 +22,11 @@ import numpy as np
 from optloc.engine import depends_on_place, equations_at, refine
 from optloc.files import read
 from optloc.lab.study.baselines import Baseline, listening, start_of
-from optloc.lab.study.folder import design_of_manifest, read_frame, read_manifest
+from optloc.lab.study.folder import read_frame, read_manifest
 from optloc.lab.study.methods import SETTINGS, StudyMethod, added
 from optloc.lab.study.minimizers import baseline_of
 from optloc.lab.study.networks import NetworkCase
+from optloc.lab.study.problem_copies import design_of_manifest
 from optloc.lab.study.profiles import check_accuracy
 from optloc.lab.study.simulation import Case, DrawnCase, draw
 from optloc.lab.study.summary import case_label, noise_text
@@ -494,9 +495,10 @@ def trials_of(
 def _trials_of_study(folder: Path, names: Sequence[str], count: int, case: str | None, noise: str | None) -> Trials:
     """Return trials and methods of a study for one case and noise level; arguments as `trials_of`."""
     manifest = read_manifest(folder)
-    design = design_of_manifest(manifest)
+    design = design_of_manifest(manifest, folder)
     if design is None:
-        raise InvalidProblem("a problem file of the study is missing or invalid", str(folder), "restore it")
+        advice = "continue the study, which copies its problem files, or add --outside"
+        raise InvalidProblem("a problem file of the study is missing or invalid", str(folder), advice)
     cells: dict[str, dict[str, Case | NetworkCase]] = {}
     for cell in design.cells:
         levels = cells.setdefault(case_label(cell.case.table.name, cell.case.sweep), {})

@@ -14,6 +14,7 @@ from threading import Lock
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.forks import held_by_forks
 from optloc.kernels.jit import compiled, inlined, replace
 from optloc.proof.atlas import frame_of, set_line
 from optloc.proof.nodes import node as columns
@@ -271,7 +272,7 @@ points_of = inlined(_generated("points_of", NODES))
 
 # Nodes of users.
 
-_LOCK = Lock()
+_LOCK = held_by_forks(Lock())
 
 
 def code_of(node: str | Node) -> int:

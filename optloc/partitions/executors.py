@@ -1,0 +1,150 @@
+"""Executors of independent tasks: in this process, on a Dask cluster or on Ray.
+
+Results come in the order of their completion. A cluster runs few tasks ahead, so that a stopped run loses little work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, TypeVar
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.threads import limited_threads, thread_count
+from optloc.partitions.clusters import dask_client, ray_cluster
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+# Tasks for each processor of a cluster: one runs, and one waits, so that no processor waits for this process.
+_AHEAD = 2
+# A worker that ends three times at one task, for example without memory, fails the task.
+_DEATHS = 3
+_ENDED = "the workers of this partition ended again and again"
+
+
+@dataclass(frozen=True, slots=True)
+class Died:
+    """The failure of a task whose workers ended, with a reason."""
+
+    reason: str
+
+
+Completed = Generator[tuple[Task, Result | Died]]
+"""Tasks with their results, in the order of their completion."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskExecutor:
+    """Choice of an executor.
+
+    Parameters
+    ----------
+    name : str
+        A key of `TASK_EXECUTORS`.
+    jobs : int, optional
+        Number of processes of a local cluster; all processors by default.
+    address : str, optional
+        Address of a Dask scheduler or of a Ray cluster; by default a local one is started.
+    """
+
+    name: str = "local"
+    jobs: int | None = None
+    address: str | None = None
+
+    def run(self, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
+        """Yield each task with the result of ``work(task)``, or with the failure of its worker.
+
+        Raises
+        ------
+        InvalidProblem
+            If the executor is not installed, or its scheduler cannot be reached.
+        """
+        # Without tasks, no cluster is started.
+        return TASK_EXECUTORS[self.name if tasks else "local"](self, work, tasks)
+
+
+def task_executor(name: str, jobs: int | None = None, address: str | None = None) -> TaskExecutor:
+    """Return an executor; raise InvalidProblem for an unknown name, or an option that it does not use."""
+    if name not in TASK_EXECUTORS:
+        raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(TASK_EXECUTORS)))
+    for flag, given in (("--scheduler", address), ("--jobs", jobs)):
+        if name == "local" and given is not None:
+            raise InvalidProblem("the fixes are computed in this process", flag, "add --executor dask")
+    return TaskExecutor(name, jobs, address)
+
+
+def _run_here(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
+    """Yield the results of tasks of this process."""
+    for task in tasks:
+        yield task, work(task)
+
+
+def run_on_one_thread(work: Callable[[Task], Result], task: Task) -> Result:
+    """Return the result of a task that uses one thread: a cluster has one worker for each processor."""
+    with limited_threads(1):
+        return work(task)
+
+
+def _run_on_dask(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
+    """Yield the results of tasks on a Dask cluster, which starts tasks of lost workers again."""
+    with dask_client(by.address, by.jobs or thread_count()) as client:
+        from distributed import KilledWorker, as_completed
+
+        waiting, running, completed = iter(tasks), dict[Any, Task](), as_completed()
+        suspects = list[Task]()
+
+        def submit(task: Task) -> Any:
+            # A task is never the same as an earlier one: the input file may have changed.
+            return client.submit(run_on_one_thread, work, task, pure=False)
+
+        def hand_out(count: int) -> None:
+            for task in islice(waiting, count):
+                future = submit(task)
+                running[future] = task
+                completed.add(future)
+
+        hand_out(_AHEAD * sum(client.ncores().values()))
+        for future in completed:
+            task = running.pop(future)
+            hand_out(1)
+            try:
+                yield task, future.result()
+            except KilledWorker:
+                suspects.append(task)
+            future.release()
+        # Dask also blames the tasks that waited at a lost worker, so each suspect is tried again alone.
+        for task in suspects:
+            try:
+                yield task, submit(task).result()
+            except KilledWorker:
+                yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
+
+
+def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
+    """Yield the results of tasks on a Ray cluster, which starts tasks of lost workers again."""
+    with ray_cluster(by.address, by.jobs or thread_count()) as ray:
+        remote = ray.remote(max_retries=_DEATHS)(run_on_one_thread)
+        waiting, running = iter(tasks), dict[Any, Task]()
+
+        def hand_out(count: int) -> None:
+            running.update((remote.remote(work, task), task) for task in islice(waiting, count))
+
+        hand_out(_AHEAD * int(ray.cluster_resources().get("CPU", 1)))
+        while running:
+            for future in ray.wait(list(running))[0]:
+                task = running.pop(future)
+                hand_out(1)
+                try:
+                    yield task, ray.get(future)
+                except ray.exceptions.WorkerCrashedError:
+                    yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
+
+
+TASK_EXECUTORS: dict[str, Callable[..., Completed[Any, Any]]] = {
+    "local": _run_here,
+    "dask": _run_on_dask,
+    "ray": _run_on_ray,
+}
+"""Executors by name."""
