@@ -295,7 +295,8 @@ def date_texts(seconds: Array) -> Array:
     """
     microseconds = np.round(seconds * 1e6).astype(np.int64)
     unit = next((unit for unit, size in (("s", 10**6), ("ms", 10**3)) if not (microseconds % size).any()), "us")
-    texts = np.datetime_as_string(microseconds.astype("datetime64[us]"), unit=unit)
+    # the unit of the dates is the unit of their texts
+    texts = np.datetime_as_string(microseconds.astype("datetime64[us]").astype(f"datetime64[{unit}]"))
     return np.char.add(texts, "Z").astype(object)
 
 
