@@ -8,6 +8,7 @@ from importlib.resources import files as package_files
 import numpy as np
 import pandas as pd
 import pytest
+from progress import without_progress
 from typer.testing import CliRunner
 
 from optloc.cli import app
@@ -29,7 +30,7 @@ def run(*arguments, code=0):
 
 def sentence(*arguments):
     result = run(*arguments, code=2)
-    assert len(result.stderr.strip().splitlines()) == 1
+    assert len(without_progress(result.stderr)) == 1
     assert "Traceback" not in result.output
     return result.stderr
 

@@ -46,7 +46,7 @@ def run_data_set(
     well as ok.
     """
     if out is None:
-        raise InvalidProblem("a data set needs a folder for its fixes", "--out", "add --out DIR")
+        raise InvalidProblem("a folder is a data set, whose fixes need another folder", str(folder), "add --out DIR")
     options = FixOptions(hints_of_options(given), method, more)
     with meter("partitions", quiet or as_json) as advance:
         account = fix_data_set(folder, out, options, by, advance)

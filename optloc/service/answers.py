@@ -287,7 +287,7 @@ def to_mark(record: Record, frame: Frame) -> Mark:
     """
     position, d = np.array(record["position"], dtype=float), len(record["position"])
     covariance = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)
-    texts = {"reason": record.get("reason", ""), "unchecked": record.get("unchecked", False)}
+    texts = {"reason": record.get("reason", ""), "unchecked": record.get("unchecked", False), "dof": record.get("dof")}
     texts |= {"undetermined": "; ".join(record["undetermined"])} if "undetermined" in record else {}
     others = [
         Other(

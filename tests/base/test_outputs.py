@@ -33,7 +33,7 @@ def run(*arguments, code=0):
     result = RUN.invoke(app, [str(a) for a in arguments])
     assert result.exit_code == code, result.output + repr(result.exception)
     if code == 2:
-        assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+        assert len(without_progress(result.stderr)) == 1, result.stderr
     return result
 
 
@@ -80,7 +80,7 @@ def test_nothing_is_written_over_without_force_and_that_is_said_at_once(command,
         (place / name).write_text("mine")
         done = RUN.invoke(app, [*command.split(), "--verbose"])
         assert done.exit_code == 2, done.output
-        *steps, refusal = done.stderr.strip().splitlines()
+        *steps, refusal = without_progress(done.stderr)
         assert "--force" in refusal
         # what was done before that is told step by step: files were read, and nothing was solved
         assert [step for step in steps if " read " not in step] == []

@@ -41,7 +41,7 @@ def test_exit_codes_follow_the_statuses_and_the_failures(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], "--out: a data set needs a folder for its fixes"),
+        ([], "a folder is a data set, whose fixes need another folder; add --out DIR"),
         (["--out", "s3://bucket/fixes"], "address of an object store"),
         (["--out", "fixes", "--plot", "a.png"], "--plot: this option has no use here"),
         (["--out", "fixes", "--noise-from-data", "auto"], "--noise-from-data: this option has no use here"),

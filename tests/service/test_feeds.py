@@ -1,6 +1,11 @@
 """Feeds of other programs in the default two phases: they carry the proven fix, and parsers of others read them."""
 
+import contextlib
 import json
+import shutil
+import socket
+import subprocess
+import time
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -66,10 +71,63 @@ def test_nmea_has_one_judged_position_for_each_event(on_earth, z, truth):
     assert [each.sentence_type for each in found] == ["GGA", "GST"] * COUNT
     for i, (place, spread) in enumerate(zip(found[::2], found[1::2], strict=True)):
         assert place.gps_qual == 1
+        assert int(place.num_sats) == len(z[i])
         assert place.timestamp.strftime("%H:%M:%S.%f") == f"22:13:2{i}.250000"
         assert (place.latitude, place.longitude) == pytest.approx((truth[0][i], truth[1][i]), abs=1e-8)
         assert place.altitude + float(place.geo_sep) == pytest.approx(truth[2][i], abs=1e-3)
         assert 0.0 < spread.std_dev_minor < spread.std_dev_major < 100.0
+
+
+@pytest.mark.skipif(shutil.which("gpsd") is None, reason="needs gpsd")
+def test_gpsd_reads_the_feed(on_earth, z, truth):
+    """gpsd reads the sentences from a socket, and reports their positions to its own readers."""
+    lines = feed(on_earth, z, "nmea")
+    with socket.create_server(("127.0.0.1", 0)) as source, socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        taken.close()
+        place = f"tcp://127.0.0.1:{source.getsockname()[1]}"
+        daemon = subprocess.Popen(["gpsd", "-N", "-n", "-S", str(port), place], stderr=subprocess.DEVNULL)
+        try:
+            reader = connected(port)
+            reader.sendall(b'?WATCH={"enable":true,"json":true};\n')
+            receiver, _ = source.accept()
+            reports = positions(reader, receiver, lines)
+        finally:
+            daemon.terminate()
+            daemon.wait(10)
+    found = [(report["lat"], report["lon"]) for report in reports]
+    for i in range(COUNT):
+        assert any(pair == pytest.approx((truth[0][i], truth[1][i]), abs=1e-7) for pair in found)
+
+
+def connected(port):
+    """Return a connection to a server that starts."""
+    for _ in range(100):
+        with contextlib.suppress(OSError):
+            return socket.create_connection(("127.0.0.1", port), timeout=1.0)
+        time.sleep(0.1)
+    raise AssertionError("gpsd does not start")
+
+
+def positions(reader, receiver, lines):
+    """Return the positions that gpsd reports while it is sent the sentences, until it has reported each of them."""
+    reports, buffer = [], b""
+    for _ in range(20):
+        for each in lines.splitlines():
+            receiver.sendall(each + b"\r\n")
+            time.sleep(0.05)
+        with contextlib.suppress(TimeoutError):
+            while True:
+                reader.settimeout(0.2)
+                buffer += reader.recv(65536)
+        read = [
+            json.loads(each) for each in buffer.splitlines() if each.startswith(b'{"class":"TPV"') and each[-1:] == b"}"
+        ]
+        reports = [each for each in read if each.get("mode", 0) >= 2]
+        if len({each["lat"] for each in reports}) >= COUNT:
+            break
+    receiver.close()
+    return reports
 
 
 def test_aircraft_and_geojson_have_the_fix_twice_and_then_judged(on_earth, z, truth):

@@ -178,7 +178,7 @@ def mark_of(
     sentence : str
         Sentence of the status, without `row`; by default the sentence of `Status`.
     texts : mapping of str, optional
-        Other entries of the row, without `row`: `reason`, `unchecked`, `undetermined`.
+        Other entries of the row, without `row`: `reason`, `unchecked`, `undetermined`, `dof`.
     **named
         Other fields of `Mark`.
     """

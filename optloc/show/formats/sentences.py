@@ -18,8 +18,11 @@ from optloc.show.formats.marks import Mark, Results, ellipse
 
 # NMEA 0183.
 
-# Talker "electronic positioning system, other": the positions do not come from satellites.
-_TALKER = "SN"
+# Talker "several navigation systems". The talker of other positioning systems, SN, is exact, but gpsd and many displays
+# read positions of satellite receivers only.
+_TALKER = "GN"
+# Largest number of sources in a sentence: the field has two digits, and readers refuse more than 12.
+_SOURCES = 12
 # Decimals of a minute of arc: a resolution of 0.2 mm.
 _MINUTES = 7
 
@@ -44,7 +47,7 @@ def sentences(mark: Mark) -> str:
     place = (_angle(lat, 2), "N" if lat >= 0.0 else "S", _angle(lon, 3), "E" if lon >= 0.0 else "W")
     # optloc has no geoid model: the height is above the ellipsoid, and the geoid separation field is 0.0.
     height_fields = (f"{height:.3f}", "M", "0.0", "M") if len(mark.position) == 3 else ("", "M", "", "M")
-    line = _sentence("GGA", clock, *place, "1", "00", "", *height_fields, "", "")
+    line = _sentence("GGA", clock, *place, "1", f"{_sources(mark):02d}", "", *height_fields, "", "")
     if not mark.covers:
         return line
     major, minor, bearing = ellipse(mark.level)
@@ -53,6 +56,16 @@ def sentences(mark: Mark) -> str:
     sizes = [f"{v:.3f}" for v in (sigma[1], sigma[0], *sigma[2:])]
     rise = [] if len(sigma) == 3 else [""]
     return line + _sentence("GST", clock, "", f"{major:.3f}", f"{minor:.3f}", f"{bearing:.1f}", *sizes, *rise)
+
+
+def _sources(mark: Mark) -> int:
+    """Return the number of measurements of a position: its coordinates plus its redundancy, if known.
+
+    Readers ignore a position from no satellite, so the number stands in the field of the satellites.
+    """
+    known = mark.row.columns.get("dof")
+    redundancy = 0 if known is None or known[mark.row.number] is None else float(known[mark.row.number])
+    return min(len(mark.position) + (int(redundancy) if redundancy > 0 else 0), _SOURCES)
 
 
 def _angle(degrees: float, digits: int) -> str:

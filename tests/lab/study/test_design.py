@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lab.study.texts import QUICK, design
+from progress import without_progress
 from typer.testing import CliRunner
 
 import optloc
@@ -76,7 +77,7 @@ BAD = {
 
 def sentence(result):
     assert result.exit_code == 2, result.output + repr(result.exception)
-    assert len(result.stderr.strip().splitlines()) == 1
+    assert len(without_progress(result.stderr)) == 1
     assert "Traceback" not in result.output
     return result.stderr
 
