@@ -176,8 +176,8 @@ def fix(
 
         refuse_options({"geojson": geojson, "plot": plot, "html": html, **estimated}, "a data set does not use it")
         by = executor_of(executor, scheduler, jobs)
-        common = {"as_json": as_json, "quiet": quiet, "allow": passing}
-        raise typer.Exit(run_data_set(file, out, method, more, given, by, **common))
+        code = run_data_set(file, out, method, more, given, by, as_json=as_json, quiet=quiet, allow=passing)
+        raise typer.Exit(code)
     refuse_options(clusters, "it is for data sets, which are folders of Parquet files")
     from optloc.cli.fix import run_fix
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.types import Array
 
 
-def event_hashes(epoch: Sequence[Any], target: Sequence[Any]) -> Array:
+def event_hashes(epoch: Iterable[Any], target: Iterable[Any]) -> Array:
     """Return 64-bit hashes (n,) of events, sorted and distinct; an event is an epoch and a target, as texts."""
     from pandas.util import hash_array
 

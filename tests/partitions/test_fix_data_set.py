@@ -163,3 +163,34 @@ def test_the_journal_names_all_that_the_fixes_depend_on(data, tmp_path):
     header = json.loads((tmp_path / "out" / JOURNAL).read_text().splitlines()[0])
     assert header["stations"].startswith("checksum ")
     assert (header["method"], header["sigma"]) == ("gtrs+lsr", SIGMA)
+
+
+@pytest.mark.full
+def test_a_worker_that_is_killed_in_the_middle_changes_nothing(tmp_path):
+    """Two workers of Dask write the bytes of one process, although one of them is killed."""
+    pytest.importorskip("distributed")
+    psutil = pytest.importorskip("psutil")
+    folder, sites = write(tmp_path / "readings", 12, 3000)
+    options = options_of(sites)
+    fix_data_set(folder, tmp_path / "one", options, HERE)
+    killed = []
+
+    def kill_once(done, total):
+        workers = [one for one in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(one.cmdline())]
+        if done >= 2 and workers and not killed:
+            killed.append(workers[-1].pid)
+            workers[-1].kill()
+
+    account = fix_data_set(folder, tmp_path / "two", options, TaskExecutor("dask", 2), kill_once)
+    assert killed
+    assert (len(account.finished), account.failed) == (12, {})
+    assert tables(tmp_path / "two") == tables(tmp_path / "one")
+
+
+@pytest.mark.slow
+def test_dask_writes_the_same_bytes(data, tmp_path):
+    pytest.importorskip("distributed")
+    folder, sites = data
+    fix_data_set(folder, tmp_path / "one", options_of(sites), HERE)
+    fix_data_set(folder, tmp_path / "two", options_of(sites), TaskExecutor("dask", 2))
+    assert tables(tmp_path / "two") == tables(tmp_path / "one")

@@ -13,9 +13,9 @@ import pytest
 from lab.study.texts import QUICK, SMALL, assert_identical, design, run_here
 
 from optloc.base.errors import InvalidProblem
-from optloc.lab.study import execute
 from optloc.lab.study.execute import EXECUTORS, executor, run_design
 from optloc.lab.study.folder import progress
+from optloc.partitions import clusters
 
 # Thirty parts or so: enough that a worker, and then the run, is killed between them.
 LONG = QUICK.replace("trials = 60", "trials = 200")
@@ -139,7 +139,7 @@ def test_unknown_executors_and_schedulers_that_are_not_there():
 
 def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(execute, "CONNECT", 1.0)
+    monkeypatch.setattr(clusters, "CONNECT", 1.0)
     out = tmp_path / "out"
     with pytest.raises(InvalidProblem, match=r"tcp://127\.0\.0\.1:1: the scheduler cannot be reached"):
         run_design(design(), out, executor("dask", None, "tcp://127.0.0.1:1"))
