@@ -61,7 +61,7 @@ def sentences(mark: Mark) -> str:
 def _sources(mark: Mark) -> int:
     """Return the number of measurements of a position: its coordinates plus its redundancy, if known.
 
-    Readers ignore a position from no satellite, so the number stands in the field of the satellites.
+    Readers ignore a position without satellites, so this number is written in their field.
     """
     known = mark.row.columns.get("dof")
     redundancy = 0 if known is None or known[mark.row.number] is None else float(known[mark.row.number])
