@@ -7,7 +7,7 @@ from optloc.base.faces import exported
 if TYPE_CHECKING:
     from optloc.advice.diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
     from optloc.model_checks.advice import advise as advise, explained as explained
-    from optloc.model_checks.geometry import Advice as Advice
+    from optloc.model_checks.cause import Advice as Advice
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)

@@ -18,7 +18,7 @@ from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
 from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.problem.epoch_groups import EpochGroup, epoch_groups, problem_of
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix

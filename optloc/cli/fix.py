@@ -38,8 +38,8 @@ from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
 from optloc.model_checks.advice import advise, advise_at, explained_at
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
-from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.plausibility import CHECKS
 from optloc.problem.fix import Fix

@@ -13,7 +13,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
-from optloc.model_checks.geometry import Advice, advise_on_geometry
+from optloc.model_checks.cause import Advice
+from optloc.model_checks.geometry import advise_on_geometry
 from optloc.model_checks.plausibility import CHECKS, suspicious_values
 from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.model_checks.unit_mistakes import advise_on_values

@@ -11,37 +11,12 @@ from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band
 from optloc.linear.constraints import is_exact, violation
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.score import descend, one_place
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """A possible reason why a fix is not `ok`, and the remedy.
-
-    Parameters
-    ----------
-    cause : str
-        A keyword for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
-        "impossible", "constraint", "size", "slant", "height", "wrap", "offset", "scale", "rotation", "drift", "step" or
-        "burst".
-    seen : str
-        The observation, a sentence without its full stop.
-    advice : str
-        The remedy, a sentence without its full stop.
-    toml : str
-        Lines of a problem file for the remedy. Put them at the end of the file; put keys into `[[measurements]]`. Empty
-        if the remedy needs no lines.
-    """
-
-    cause: str
-    seen: str
-    advice: str
-    toml: str = ""
-
 
 # Limit of the chi-square that separates a position from its mirror image, if stations are not exactly in a plane. Below
 # the limit, the data separate no position from its image by three sigma.

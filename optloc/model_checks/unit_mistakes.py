@@ -15,7 +15,7 @@ from optloc.base.types import Array, Rows
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.linear.constraints import exact, violation_names
 from optloc.linear.redundancy import degrees_of_freedom
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.score import descend, fit_anywhere, one_place
 from optloc.models import MODELS
 from optloc.models.primitives import wrap

@@ -38,7 +38,7 @@ from optloc.show.fix_answer import AnswerSection, FixAnswer, FixSheet, Row, Sect
 from optloc.show.knowledge import has_place, known_rows
 
 if TYPE_CHECKING:
-    from optloc.model_checks.geometry import Advice
+    from optloc.model_checks.cause import Advice
 
 # Reasons that are printed for a batch: a screen shows them. The remaining ones are counted.
 _REASONS = 10
