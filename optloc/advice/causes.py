@@ -1,0 +1,157 @@
+"""The causes of a misfit: all explanations in one comparison, and the advice on the best of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.advice.change import Case, Change, Wording
+from optloc.advice.explanations import EXPLANATIONS
+from optloc.advice.fits import Fits, fit
+from optloc.advice.scores import GAP, Scored, score_of_level, scored
+from optloc.advice.suspects import Suspects
+from optloc.base.types import Array
+from optloc.model_checks.cause import Advice
+
+# Smallest price of any explanation: a misfit of a smaller cost has no cause.
+_CHEAPEST = 2.0
+# Largest number of causes that are listed if the data do not decide.
+_LISTED = 3
+# Number of epochs in which other readings are compared first, and the number of readings that are compared in all.
+_FIRST_EPOCHS, _KEPT = 2, 8
+# Relative difference of the costs of equal explanations: rounding, and the end of the descents.
+_EQUAL = 1e-3
+
+
+def causes_of(case: Case) -> tuple[Scored, ...]:
+    """Return the explanations that the data do not exclude, the best first; empty if none is needed.
+
+    The first is alone if all others score worse by the gap.
+    """
+    plain = fit(case, [Change("none", _no_words)])
+    cost, dof = float(plain.cost.sum()), int(case.dof.sum())
+    if cost < GAP + _CHEAPEST or dof < 1:
+        return ()
+    case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
+    found = [*all_scores(case), _of_level(case, plain, cost, dof)]
+    found.sort(key=lambda one: one.score)
+    if found[0].score > cost - GAP:
+        return ()
+    return tuple(_distinct(found))[:_LISTED]
+
+
+def all_scores(case: Case) -> list[Scored]:
+    """Return the scores of all changes of all explanations."""
+    suspects, changes, odds = Suspects(case), [], []
+    for entry in list(EXPLANATIONS.values()):
+        for change in entry.changes(case, suspects):
+            changes.append(change)
+            odds.append(entry.price)
+    out = []
+    own = [i for i, change in enumerate(changes) if change.base is None]
+    own = _promising(case, changes, own)
+    if own:
+        some = [changes[i] for i in own]
+        out += scored(case, some, fit(case, some), [odds[i] for i in own])
+    for i, change in enumerate(changes):
+        if change.base is not None:
+            other = _in_base(case, change)
+            out += scored(other, [change], fit(other, [change]), [odds[i]])
+    return out
+
+
+def _in_base(case: Case, change: Change) -> Case:
+    """Return the case in the structure of a change that has its own."""
+    assert change.base is not None
+    x = np.zeros((len(case.times), change.base.layout.size))
+    new, old = change.base.layout, case.base.layout
+    for slot in old.shared:
+        there, _ = new.find(slot.name)
+        size = min(slot.size, there.size)
+        x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
+    return replace(case, base=change.base, x=x)
+
+
+def _promising(case: Case, changes: Sequence[Change], numbers: list[int]) -> list[int]:
+    """Return the numbers of the changes without the readings that a few epochs exclude."""
+    readings = [i for i in numbers if not changes[i].station and not changes[i].columns and not changes[i].members]
+    if len(case.times) <= _FIRST_EPOCHS or len(readings) <= _KEPT:
+        return numbers
+    first = np.argsort(-case.dof, kind="stable")[:_FIRST_EPOCHS]
+    few = Case(case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin)
+    some = [changes[i] for i in readings]
+    of_first = {id(one.change): one.score for one in scored(few, some, fit(few, some), [0.0] * len(some))}
+    kept = sorted(readings, key=lambda i: of_first.get(id(changes[i]), np.inf))[:_KEPT]
+    return [i for i in numbers if i not in set(readings) - set(kept)]
+
+
+def _of_level(case: Case, plain: Fits, cost: float, dof: int) -> Scored:
+    """Return the explanation that all noise is understated."""
+    level = float(np.sqrt(cost / dof))
+
+    def words(theta: Array, sigma: Array) -> Wording:
+        seen = f"noise that is {level:.3g} times as large as stated would explain the misfit"
+        lines = f"weight = {level**-2:.6g}\n" if len(case.kinds) == 1 else ""
+        return Wording(seen, "state a larger noise, or use `--rescale-noise` for several epochs", lines)
+
+    none = np.zeros(0)
+    change = Change("noise", words, spread=level, levels=True)
+    return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0])
+
+
+def _no_words(theta: Array, sigma: Array) -> Wording:
+    return Wording("", "")
+
+
+def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:
+    """Yield the explanations within the gap of the best; of equal ones, only the simplest.
+
+    `found` is in ascending order of the score.
+    """
+    names, kept = list(EXPLANATIONS), []
+    for one in found:
+        if one.score > found[0].score + GAP:
+            break
+        equal = next((i for i, other in enumerate(kept) if _is_equal(one, other)), None)
+        if equal is None:
+            kept.append(one)
+        elif _rank(one, names) < _rank(kept[equal], names):
+            kept[equal] = replace(one, score=kept[equal].score)
+    yield from kept
+
+
+def _rank(one: Scored, names: list[str]) -> int:
+    """Return the place of a cause in the table: the simplest cause of a station comes first."""
+    return names.index(one.change.cause) if one.change.cause in names else len(names)
+
+
+def _is_equal(one: Scored, other: Scored) -> bool:
+    """Return whether two explanations are the same statement about the same stations."""
+    if (one.change.cause, one.change.station, one.change.kind) == (other.change.cause, other.change.station, other.change.kind):
+        return not (one.change.members and one.change.members != other.change.members) or one.change.cause == "noise"
+    same = set(one.change.station) == set(other.change.station) and one.change.station
+    return bool(same and one.dof == other.dof and abs(one.cost - other.cost) < _EQUAL * (1.0 + one.cost))
+
+
+def advice_on(found: Sequence[Scored]) -> Iterator[Advice]:
+    """Yield the advice on explanations in ascending order of their scores."""
+    for i, one in enumerate(found):
+        words = one.change.words(one.theta, one.sigma)
+        rivals = [other.score for j, other in enumerate(found) if j != i]
+        gap = min(rivals) - one.score if rivals else GAP
+        p = f" (p = {one.p:.2g} with it)" if np.isfinite(one.p) and one.change.cause != "noise" else ""
+        yield Advice(
+            one.change.cause,
+            words.seen + p,
+            words.advice,
+            words.toml,
+            words.option,
+            one.change.station,
+            one.change.members,
+            tuple(one.theta.tolist()),
+            one.cost,
+            gap,
+            one.p,
+        )

@@ -1,0 +1,213 @@
+"""Explanations by another reading of all values: unit, sign, sense of bearings, declination, speed, coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from optloc.advice.change import Case, Change, Column, Wording
+from optloc.advice.suspects import Suspects
+from optloc.advice.wording import bias_lines, size_text
+from optloc.base.types import Array, CompassRows
+from optloc.base.units import SPEED_OF_LIGHT, UNITS
+from optloc.models import MODELS
+
+_TIMES = ("s", "ms", "us", "ns", "ps")
+# Units that a file states, first the unit without a statement; and units that may be meant. Feet occur if the unit is
+# not stated, thousands if the prefix is wrong, and times if the speed of the wave is missing.
+_STATED_UNITS = ("m", "s", "ns")
+_MEANT_UNITS = ("m", "km", "mm", "cm", "ft", "s", "ms", "us", "ns")
+# Largest number of pairs of units in a sentence.
+_MAX_PAIRS = 3
+# Units of coordinates that may be meant where metres are stated, and the other way round.
+_COORDINATE_UNITS = ("km", "cm", "mm", "ft")
+# Speeds that may be confused, m/s: light, sound in air and in water.
+_SPEEDS = (SPEED_OF_LIGHT, 343.0, 1500.0)
+# Starts of the scale of all lengths: a speed that is wrong by up to a factor of four.
+_SCALES = (-0.75, -0.5, -0.2, 0.0, 0.25, 1.0, 3.0)
+# Starts of the declination, rad: every 45 degrees.
+_TURNS = tuple(np.radians(np.arange(-135.0, 181.0, 45.0)).tolist())
+
+
+def units(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield other units of the lengths and of the angles, each with the noise in the same unit and as stated."""
+    lengths = tuple(kind for kind in case.kinds if MODELS[kind].quantity == "length" and MODELS[kind].stations)
+    groups = [group for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))) if group]
+    ratios = _ratios()
+    for group in groups:
+        rows = np.any([case.rows_of(kind) for kind in group], axis=0)
+        for ratio, (stated, meant) in ratios.items():
+            words = partial(_unit_words, group, stated, meant, ratio)
+            yield from _read(case, rows, ratio, words, "unit", len(ratios) * len(groups))
+    angles = tuple(kind for kind in case.kinds if MODELS[kind].quantity == "angle")
+    rows = case.rows_where("angle")
+    for stated, meant, ratio in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)) if angles else ():
+        words = partial(_angle_words, angles, stated, meant)
+        yield from _read(case, rows, ratio, words, "unit", 2)
+
+
+def _read(case: Case, rows: Array, ratio: float, words, cause: str, choices: float) -> Iterator[Change]:  # type: ignore[no-untyped-def]
+    """Yield values times a ratio, with noise times this ratio, and with the stated noise.
+
+    The values of compass bearings turn about north.
+    """
+    factor, shift = np.where(rows, ratio, 1.0), np.zeros(len(rows))
+    for i, block in enumerate(case.base.rows):
+        if isinstance(block, CompassRows) and rows[case.part(i)].any():
+            shift[case.part(i)] = np.pi / 2 * (1.0 - ratio)
+    yield Change(cause, words, factor=factor, shift=shift, alternatives=choices)
+    # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
+    yield Change(cause, words, factor=factor, shift=shift, spread=np.where(rows, 1.0 / ratio, 1.0), alternatives=choices)
+
+
+def _ratios() -> dict[float, tuple[str, str]]:
+    """Return the stated and the meant unit by the ratio of their sizes; times are multiplied by the speed of light."""
+    table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
+    out: dict[float, tuple[str, str]] = {}
+    for stated in _STATED_UNITS:
+        for meant in _MEANT_UNITS:
+            ratio = table[meant] / table[stated]
+            if ratio != 1.0 and not any(abs(ratio / old - 1.0) < 1e-6 for old in out):
+                out[ratio] = (stated, meant)
+    return out
+
+
+def _unit_words(
+    kinds: tuple[str, ...], stated: str, meant: str, ratio: float, theta: Array, sigma: Array
+) -> Wording:
+    table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
+    what = " and ".join(kinds)
+    pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
+    seen = f"the {what} values fit in {meant} instead of the stated {stated}, {ratio:.4g} times as large"
+    advice = f"state their unit; by the ratio it may be {' or '.join(pairs[:_MAX_PAIRS])}"
+    return Wording(seen, advice, f'unit = "{meant}"\n')
+
+
+def _angle_words(kinds: tuple[str, ...], stated: str, meant: str, theta: Array, sigma: Array) -> Wording:
+    seen = f"the {' and '.join(kinds)} values fit in {meant} instead of the stated {stated}"
+    return Wording(seen, "state their unit", f'unit = "{meant}"\n')
+
+
+def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield the opposite sign of all differences, and of all arrival times."""
+    for kind in case.kinds:
+        model = MODELS[kind]
+        if model.ranges != (1, -1) and not model.emission and kind != "rss_difference":
+            continue
+        difference = not model.emission
+        words = partial(_sign_words, kind, difference)
+        yield Change("sign", words, factor=np.where(case.rows_of(kind), -1.0, 1.0))
+
+
+def _sign_words(kind: str, difference: bool, theta: Array, sigma: Array) -> Wording:
+    seen = f"the {kind} values fit with the opposite sign"
+    if difference:
+        advice = "state which station is farther if the number is positive (remove the key if it is there)"
+        return Wording(seen, advice, 'positive = "b-farther"\n')
+    return Wording(f"{seen}: the counters count down to zero", "write a minus before each value")
+
+
+def senses(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield other senses of azimuths: compass, anticlockwise from north, clockwise from east, and half a turn."""
+    rows = case.rows_of("azimuth")
+    if "azimuth" not in case.kinds:
+        return
+    compass = any(isinstance(block, CompassRows) and block.kind == "azimuth" for block in case.base.rows)
+    half, key = np.pi / 2, "azimuth = "
+    if compass:
+        # the reading r was taken as pi/2 - r
+        yield _sense(rows, "compass", -1.0, half, "as angles from east, counter-clockwise", f'{key}"east-counterclockwise"\n')
+        yield _sense(
+            rows, "anticlockwise", -1.0, np.pi, "counter-clockwise from north", f'{key}"north-counterclockwise"\n'
+        )
+    else:
+        yield _sense(rows, "compass", -1.0, half, "as compass bearings", f'{key}"north-clockwise"\n')
+        yield _sense(rows, "anticlockwise", 1.0, half, "counter-clockwise from north", f'{key}"north-counterclockwise"\n')
+    yield _sense(
+        rows, "opposite", 1.0, np.pi, "from the target to the station, half a turn more", 'correction = "180 deg"\n'
+    )
+
+
+def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml: str) -> Change:
+    return Change(
+        cause,
+        partial(_sense_words, how, toml),
+        factor=np.where(rows, factor, 1.0),
+        shift=np.where(rows, shift, 0.0),
+        alternatives=3,
+    )
+
+
+def _sense_words(how: str, toml: str, theta: Array, sigma: Array) -> Wording:
+    return Wording(f"the azimuths do not intersect as read, but they do {how}", "state the convention", toml)
+
+
+def declinations(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield one turn of all azimuths."""
+    if "azimuth" not in case.kinds or len(case.stations) < 2:
+        return
+    column = np.broadcast_to(case.coefficients("kind", "offset", "azimuth"), case.present.shape)
+    starts = tuple((turn,) for turn in _TURNS)
+    yield Change("declination", partial(_turn_words, case), columns=(Column("adds", column),), starts=starts)
+
+
+def _turn_words(case: Case, theta: Array, sigma: Array) -> Wording:
+    seen = f"a turn of all azimuths by {size_text(theta[0], sigma[0], 'rad')} would explain the misfit"
+    advice = "check north: state the declination, or model the error"
+    return Wording(seen, advice, bias_lines(case, "offset", "kind", "azimuth"))
+
+
+def speeds(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield one factor of all lengths: another speed of the wave."""
+    rows = case.rows_where("length")
+    if not case.present[:, rows].any():
+        return
+    known = [one / other - 1.0 for one in _SPEEDS for other in _SPEEDS if one != other]
+    column = np.broadcast_to(rows * 1.0, case.present.shape)
+    starts = tuple((start,) for start in (*_SCALES, *known))
+    kinds = [kind for kind in case.kinds if rows[case.rows_of(kind)].any()]
+    yield Change("speed", partial(_speed_words, case, kinds), columns=(Column("scales", column),), starts=starts)
+
+
+def _speed_words(case: Case, kinds: list[str], theta: Array, sigma: Array) -> Wording:
+    ratio = 1.0 / (1.0 + theta[0])
+    seen = f"the lengths fit if all are multiplied by {ratio:.6g} (± {100.0 * sigma[0] / (1.0 + theta[0]):.2g} %)"
+    advice = f"check the speed of the wave, {ratio:.5g} times the stated one, and the unit; until then, model the error"
+    lines = bias_lines(case, "scale", "kind", kinds[0]) if len(kinds) == 1 else ""
+    return Wording(seen, advice, lines)
+
+
+def coordinate_units(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield other units of the coordinates of the stations."""
+    place = case.base.stations.position
+    if case.base.frame.geodetic or not case.present[:, case.rows_where("length")].any():
+        return
+    sizes = [UNITS["length"][unit] for unit in _COORDINATE_UNITS]
+    factors = {unit: size for unit, size in zip(_COORDINATE_UNITS, sizes, strict=True)}
+    for unit, size in factors.items():
+        for factor, stated, meant in ((size, "m", unit), (1.0 / size, unit, "m")):
+            words = partial(_coordinate_words, stated, meant, factor)
+            yield Change("coordinate-unit", words, position=place * factor, alternatives=2 * len(factors))
+
+
+def _coordinate_words(stated: str, meant: str, factor: float, theta: Array, sigma: Array) -> Wording:
+    seen = f"the values fit if the coordinates of the stations are {factor:.4g} times as large, {meant} instead of {stated}"
+    return Wording(seen, "state the unit of the stations", f'[stations]\nunit = "{meant}"\n')
+
+
+def swapped_coordinates(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield exchanged latitudes and longitudes of all stations."""
+    stations, frame = case.base.stations, case.base.frame
+    if not frame.geodetic or stations.position.ndim > 3 or stations.axes is not None and stations.axes.ndim > 4:
+        return
+    lat, lon, height = frame.to_geodetic(stations.position)
+    if np.abs(lon).max() > 90.0:
+        return
+    position = frame.from_geodetic(lon, lat, height)
+    yield Change("lat-lon", _lat_lon_words, position=position)
+
+
+def _lat_lon_words(theta: Array, sigma: Array) -> Wording:
+    return Wording("the values fit if latitude and longitude of the stations are exchanged", "exchange the two columns")
