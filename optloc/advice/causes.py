@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from optloc.advice.change import Case, Change, Wording
-from optloc.advice.explanations import EXPLANATIONS
+from optloc.advice.explanations import EXPLANATIONS, LATE_PRICE
 from optloc.advice.fits import Fits, fit
-from optloc.advice.scores import GAP, Scored, score_of_level, scored
+from optloc.advice.rows_and_noise import late_fit, late_words
+from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
 from optloc.advice.suspects import Suspects
 from optloc.base.types import Array
 from optloc.model_checks.cause import Advice
@@ -35,7 +37,7 @@ def causes_of(case: Case) -> tuple[Scored, ...]:
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
     case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
-    found = [*all_scores(case), _of_level(case, plain, cost, dof)]
+    found = [*all_scores(case), _of_level(case, plain, cost, dof), *_of_late_rows(case)]
     found.sort(key=lambda one: one.score)
     if found[0].score > cost - GAP:
         return ()
@@ -99,6 +101,17 @@ def _of_level(case: Case, plain: Fits, cost: float, dof: int) -> Scored:
     none = np.zeros(0)
     change = Change("noise", words, spread=level, levels=True)
     return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0])
+
+
+def _of_late_rows(case: Case) -> Iterator[Scored]:
+    """Yield the explanation that some rows are late."""
+    found = late_fit(case)
+    if found is not None:
+        change, theta, sigma = Change("late", partial(late_words, found)), np.array([found.share, found.delay]), np.zeros(2)
+        dof = int(case.dof.sum()) - 2
+        price = LATE_PRICE + price_of_parameters(np.zeros(2), np.ones(2))
+        # residuals of late rows have no chi-square
+        yield Scored(change, theta, sigma, np.nan, dof, found.score + price, found.x)
 
 
 def _no_words(theta: Array, sigma: Array) -> Wording:

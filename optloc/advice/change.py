@@ -76,10 +76,6 @@ class Change:
         Values of the parameters from which the fit starts. Empty: the fit starts without the affected rows.
     alternatives : float
         Number of alternatives among which data choose this one.
-    groups : int
-        Number of groups of rows that the change leaves out, with the price of a suspect each.
-    removed : int
-        Number of rows that the change leaves out.
     extra : int
         Number of unknowns that another structure adds.
     levels : bool
@@ -103,8 +99,6 @@ class Change:
     moved: int = -1
     starts: tuple[tuple[float, ...], ...] = ()
     alternatives: float = 1.0
-    groups: int = 0
-    removed: int = 0
     extra: int = 0
     levels: bool = False
     kind: str = ""

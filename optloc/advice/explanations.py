@@ -33,6 +33,9 @@ class Explanation:
 # Prices by how often a cause is seen: odds of 3, 10 and 30 to 1.
 _COMMON, _USUAL, _RARE = 2.2, 4.6, 6.8
 
+LATE_PRICE = _USUAL
+"""Price of late signals, which are a distribution of errors and no change of values."""
+
 EXPLANATIONS: Registry[Explanation] = Registry(
     "optloc.explanations",
     lambda value: isinstance(value, Explanation),
@@ -45,7 +48,7 @@ EXPLANATIONS: Registry[Explanation] = Registry(
         "swapped": Explanation("two stations are exchanged", _RARE, station_errors.exchanges),
         "reference": Explanation("another reference station", _RARE, station_errors.references),
         "moved": Explanation("one station is at another position", _RARE, station_errors.moves),
-        "outlier": Explanation("one or two wrong rows", 0.0, rows_and_noise.outliers),
+        "outlier": Explanation("one or two wrong rows", _USUAL, rows_and_noise.outliers),
         "noise": Explanation("larger noise of a kind or station", _USUAL, rows_and_noise.levels),
         "unit": Explanation("another unit of the values", _USUAL, readings.units),
         "coordinate-unit": Explanation("another unit of the coordinates", _RARE, readings.coordinate_units),

@@ -17,7 +17,7 @@ from optloc.models import MODELS
 _TIMES = ("s", "ms", "us", "ns", "ps")
 # Units that a file states, first the unit without a statement; and units that may be meant. Feet occur if the unit is
 # not stated, thousands if the prefix is wrong, and times if the speed of the wave is missing.
-_STATED_UNITS = ("m", "s", "ns")
+_STATED_UNITS = ("m", "s", "ns", "ft")
 _MEANT_UNITS = ("m", "km", "mm", "cm", "ft", "s", "ms", "us", "ns")
 # Largest number of pairs of units in a sentence.
 _MAX_PAIRS = 3
@@ -25,6 +25,8 @@ _MAX_PAIRS = 3
 _COORDINATE_UNITS = ("km", "cm", "mm", "ft")
 # Speeds that may be confused, m/s: light, sound in air and in water.
 _SPEEDS = (SPEED_OF_LIGHT, 343.0, 1500.0)
+# Rounding of angles, rad: full turns are no more than full turns.
+_ROUNDED = 1e-3
 # Starts of the scale of all lengths: a speed that is wrong by up to a factor of four.
 _SCALES = (-0.75, -0.5, -0.2, 0.0, 0.25, 1.0, 3.0)
 # Starts of the declination, rad: every 45 degrees.
@@ -57,9 +59,23 @@ def _read(case: Case, rows: Array, ratio: float, words, cause: str, choices: flo
     for i, block in enumerate(case.base.rows):
         if isinstance(block, CompassRows) and rows[case.part(i)].any():
             shift[case.part(i)] = np.pi / 2 * (1.0 - ratio)
+        # readings of angles are within one turn, so that a larger unit must not make several turns of them
+        if MODELS[block.kind].period is not None and rows[case.part(i)].any():
+            reading = np.where(case.present, ratio * (np.abs(_readings(case)) - _ROUNDED), 0.0)[:, case.part(i)]
+            if np.abs(reading).max() > 2.0 * np.pi:
+                return
     yield Change(cause, words, factor=factor, shift=shift, alternatives=choices)
     # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
     yield Change(cause, words, factor=factor, shift=shift, spread=np.where(rows, 1.0 / ratio, 1.0), alternatives=choices)
+
+
+def _readings(case: Case) -> Array:
+    """Return the values (K, m) as they were read: compass bearings clockwise from north."""
+    z = np.array(np.broadcast_to(case.base.z, case.present.shape))
+    for i, block in enumerate(case.base.rows):
+        if isinstance(block, CompassRows):
+            z[:, case.part(i)] = np.pi / 2 - z[:, case.part(i)]
+    return z
 
 
 def _ratios() -> dict[float, tuple[str, str]]:
@@ -69,7 +85,7 @@ def _ratios() -> dict[float, tuple[str, str]]:
     for stated in _STATED_UNITS:
         for meant in _MEANT_UNITS:
             ratio = table[meant] / table[stated]
-            if ratio != 1.0 and not any(abs(ratio / old - 1.0) < 1e-6 for old in out):
+            if abs(ratio - 1.0) > 1e-6 and not any(abs(ratio / old - 1.0) < 1e-6 for old in out):
                 out[ratio] = (stated, meant)
     return out
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 
 import numpy as np
+from scipy.special import log_ndtr
 
-from optloc.advice.change import Case, Change, Wording
+from optloc.advice.change import Case, Change, Column, Wording
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import row_name
 from optloc.base.types import Array
+from optloc.linear.normal import linearise
+from optloc.model_checks.score import descend
+from optloc.models import MODELS
+from optloc.problem.noise import variances
 
 # Epochs with the largest cost whose rows may be outliers, and the largest number of rows of which pairs are tried.
 _EPOCHS, _PAIRED = 3, 8
@@ -24,29 +30,33 @@ _FEW = 6
 def outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
     """Yield single rows without which the others may fit, and pairs of such rows."""
     rows = _worst_rows(case)
+    many = int(case.present.sum())
     for pair in [*((row,) for row in rows), *combinations(rows[:_PAIRED], 2)]:
-        weight = np.ones(case.present.shape)
+        columns = []
         for epoch, row in pair:
-            weight[epoch, row] = 0.0
-        a, b = case.ends
-        ends = {int(i) for _, row in pair for i in (a[row], b[row]) if i >= 0}
-        common = {int(i) for i in b[case.present.any(0)]}
-        own = [i for i in ends if len(common) > 1 or i not in common] or list(ends)
+            mark = np.zeros(case.present.shape)
+            mark[epoch, row] = 1.0
+            columns.append(Column("adds", mark))
         yield Change(
             "outlier" if len(pair) == 1 else "outliers",
             partial(_outlier_words, case, pair),
-            tuple(case.names[i] for i in sorted(own)),
+            tuple(case.names[i] for i in _blamed(case, [row for _, row in pair])),
             tuple(int(case.number[epoch, row]) for epoch, row in pair),
-            weight=weight,
-            groups=len(pair),
-            removed=len(pair),
+            columns=tuple(columns),
+            alternatives=many if len(pair) == 1 else many * (many - 1) / 2,
         )
+
+
+def _blamed(case: Case, rows: list[int]) -> list[int]:
+    """Return the stations of rows, without a reference station that all rows have in common."""
+    a, b = case.ends
+    ends = {int(i) for row in rows for i in (a[row], b[row]) if i >= 0}
+    references = set(b[case.present.any(0)].tolist())
+    return sorted(ends - references if len(references) == 1 and ends - references else ends)
 
 
 def _worst_rows(case: Case) -> list[tuple[int, int]]:
     """Return epoch and number of the rows of the epochs with the largest cost, the largest residuals first."""
-    from optloc.linear.normal import linearise
-
     linear = linearise(case.base, case.x)
     size = np.zeros(case.present.shape)
     for whitener in linear.noise:
@@ -82,3 +92,79 @@ def _level_words(what: str, kind: str, level: float, theta: Array, sigma: Array)
     seen = f"the noise of {what} would explain the misfit if it were about {level:.2g} times as large as stated"
     lines = f"weight = {level**-2:.6g}\n" if kind else ""
     return Wording(seen, "state its noise", lines)
+
+
+# Late signals.
+
+# Steps of the alternation between the shares of late rows and the positions, and its starts: shares and mean delays, in
+# sigmas, of late rows.
+_ROUNDS, _STARTS = 12, ((0.15, 10.0), (0.3, 40.0), (0.3, 150.0))
+# Smallest number of degrees of freedom for two parameters of a distribution.
+_MANY = 8
+
+
+@dataclass(frozen=True, slots=True)
+class LateFit:
+    """A mixture of punctual and late rows: -2 log likelihood, share, mean delay in sigmas, and positions (K, size)."""
+
+    score: float
+    share: float
+    delay: float
+    x: Array
+
+
+def late_fit(case: Case) -> LateFit | None:
+    """Return the fit of values of which a share is late by an exponential delay; None for kinds without delays.
+
+    Delays only lengthen a range, an arrival time or a sum of ranges. The density of a row is
+    ``(1 - share) N(r) + share (N * Exp)(r)``, with the residual r in sigmas. The positions follow from an EM
+    alternation, in which late rows have the mean and the variance of their delay.
+
+    References
+    ----------
+    E. Grushka, Anal. Chem. 44 (1972): the exponentially modified Gaussian.
+    """
+    models = [MODELS[kind] for kind in case.kinds]
+    if int(case.dof.sum()) < _MANY or not all(m.ranges in ((1, 0), (1, 1)) and m.straight is None for m in models):
+        return None
+    if any(block.row.shape[1] > 1 for block in case.base.noise.blocks):
+        return None
+    fits = [_alternate(case, share, delay) for share, delay in _STARTS]
+    return min(fits, key=lambda one: one.score)
+
+
+def _alternate(case: Case, share: float, delay: float) -> LateFit:
+    """Return the mixture after the alternation, from a share and a mean delay."""
+    sigma = np.sqrt(variances(case.base.noise, case.base.count)) * np.ones(case.present.shape)
+    sigma = sigma / np.sqrt(np.where(case.present, case.base.weight, 1.0))
+    x, z = case.x, np.where(case.present, np.broadcast_to(case.base.z, sigma.shape), 0.0)
+    for _ in range(_ROUNDS):
+        residual = np.where(case.present, linearise(case.base, x).residual / sigma, 0.0)
+        punctual, late = _densities(residual, delay)
+        chance = share * late / np.maximum((1.0 - share) * punctual + share * late, 1e-300)
+        # of a late row, the delay has the mean of its truncated exponential, and noise of this size
+        expected = np.clip(residual, 0.0, None)
+        precision = (1.0 - chance) + chance / (1.0 + delay**2)
+        shift = chance / (1.0 + delay**2) * delay / precision
+        lanes = case.base.with_rows(z=z - shift * sigma, weight=case.base.weight * precision)
+        x, _ = descend(lanes, x)
+        use = case.present
+        share = float(np.clip(chance[use].mean(), 0.02, 0.6))
+        delay = float(np.clip((chance * expected)[use].sum() / max(chance[use].sum(), 1e-9), 3.0, 1e4))
+    residual = linearise(case.base, x).residual / sigma
+    punctual, late = _densities(residual, delay)
+    density = np.maximum((1.0 - share) * punctual + share * late, 1e-300)
+    return LateFit(float(-2.0 * np.log(density)[case.present].sum()), share, delay, x)
+
+
+def _densities(residual: Array, delay: float) -> tuple[Array, Array]:
+    """Return the densities of punctual and of late rows, in units of the peak of a normal density."""
+    late = np.exp(log_ndtr(residual - 1.0 / delay) + 0.5 / delay**2 - residual / delay) * np.sqrt(2.0 * np.pi) / delay
+    return np.exp(-0.5 * residual**2), late
+
+
+def late_words(fit: LateFit, theta: Array, sigma: Array) -> Wording:
+    """Return the text about late signals."""
+    seen = f"late signals would explain the misfit: {fit.share:.0%} of the rows, late by {fit.delay:.3g} sigma on average"
+    advice = "use a loss for late rows, or remove the receivers without a line of sight"
+    return Wording(seen, advice, "", "--late-from-data")

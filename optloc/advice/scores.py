@@ -27,8 +27,6 @@ _DENSITY = 2.0 * np.log(1e4) / np.sqrt(2.0 * np.pi)
 _LEAST = 3.0
 # Prior spread of the logarithm of a wrong noise level: a factor of four and a half is one sigma.
 _LEVEL = 1.5
-ROW_PRICE = 16.0
-"""Price of a row that is left out, which is the price of a suspect: odds of 100, and a spread of 100 sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +89,7 @@ def scored(case: Case, changes: list[Change], fits: Fits, odds: list[float]) -> 
     out, all_rows = [], int(case.present.sum())
     for e, change in enumerate(changes):
         cost, q = float(fits.cost[e].sum()), change.size(case.base.dimension)
-        dof = int(case.dof.sum()) - q - change.removed - change.extra
+        dof = int(case.dof.sum()) - q - change.extra
         if not np.isfinite(cost) or dof < 0:
             continue
         spread = np.broadcast_to(change.spread, case.present.shape)
@@ -102,7 +100,7 @@ def scored(case: Case, changes: list[Change], fits: Fits, odds: list[float]) -> 
             share = max(float(case.dof.sum()), 1.0) / max(all_rows, 1)
             enlarged = enlarged * share + price_of_level(float(spread.max()), inside * share)
         theta, sigma = fits.theta[e, :q], fits.sigma[e, :q]
-        price = odds[e] + 2.0 * float(np.log(change.alternatives)) + ROW_PRICE * change.groups
+        price = odds[e] + 2.0 * float(np.log(change.alternatives))
         price += price_of_parameters(theta, sigma) + change.extra * price_of_parameters(np.array([30.0]), np.ones(1))
         out.append(Scored(change, theta, sigma, cost, dof, cost + enlarged + price, fits.x[e]))
     return out
