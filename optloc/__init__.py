@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     import optloc.station_health
     import optloc.tracking
     import optloc.uncertainty
+    from optloc.advice.advising import advise as advise
     from optloc.advice.diagnosis import diagnose as diagnose
     from optloc.base import units as units
     from optloc.base.errors import InvalidProblem as InvalidProblem, NoSolution as NoSolution
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
     from optloc.lab import datasets as datasets
     from optloc.linear import constraints as constraints
     from optloc.linear.simulate import simulate as simulate
-    from optloc.model_checks.advice import advise as advise
     from optloc.multi_target.assign import separate as separate
     from optloc.problem.bias import with_bias as with_bias
     from optloc.problem.build import assemble as assemble, measured as measured, station_array as station_array

@@ -14,6 +14,7 @@ from optloc.advice.fits import Fits, fit
 from optloc.advice.rows_and_noise import late_fit, late_words
 from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
 from optloc.advice.suspects import Suspects
+from optloc.advice.wording import no_words
 from optloc.base.types import Array
 from optloc.model_checks.cause import Advice
 
@@ -32,7 +33,7 @@ def causes_of(case: Case) -> tuple[Scored, ...]:
 
     The first is alone if all others score worse by the gap.
     """
-    plain = fit(case, [Change("none", _no_words)])
+    plain = fit(case, [Change("none", no_words)])
     cost, dof = float(plain.cost.sum()), int(case.dof.sum())
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
@@ -52,8 +53,12 @@ def all_scores(case: Case) -> list[Scored]:
             changes.append(change)
             odds.append(entry.price)
     out = []
-    own = [i for i, change in enumerate(changes) if change.base is None]
+    fitted = {id(change) for change in suspects.offsets}
+    own = [i for i, change in enumerate(changes) if change.base is None and id(change) not in fitted]
     own = _promising(case, changes, own)
+    if suspects.offsets:
+        price = EXPLANATIONS["offset"].price
+        out += scored(case, list(suspects.offsets), suspects.fits, [price] * len(suspects.offsets))
     if own:
         some = [changes[i] for i in own]
         out += scored(case, some, fit(case, some), [odds[i] for i in own])
@@ -73,6 +78,7 @@ def _in_base(case: Case, change: Change) -> Case:
         there, _ = new.find(slot.name)
         size = min(slot.size, there.size)
         x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
+    x[:, new.n_shared :] = case.x[:, old.n_shared :]
     return replace(case, base=change.base, x=x)
 
 
@@ -82,7 +88,9 @@ def _promising(case: Case, changes: Sequence[Change], numbers: list[int]) -> lis
     if len(case.times) <= _FIRST_EPOCHS or len(readings) <= _KEPT:
         return numbers
     first = np.argsort(-case.dof, kind="stable")[:_FIRST_EPOCHS]
-    few = Case(case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin)
+    few = Case(
+        case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin
+    )
     some = [changes[i] for i in readings]
     of_first = {id(one.change): one.score for one in scored(few, some, fit(few, some), [0.0] * len(some))}
     kept = sorted(readings, key=lambda i: of_first.get(id(changes[i]), np.inf))[:_KEPT]
@@ -107,15 +115,11 @@ def _of_late_rows(case: Case) -> Iterator[Scored]:
     """Yield the explanation that some rows are late."""
     found = late_fit(case)
     if found is not None:
-        change, theta, sigma = Change("late", partial(late_words, found)), np.array([found.share, found.delay]), np.zeros(2)
+        change, theta = Change("late", partial(late_words, found)), np.array([found.share, found.delay])
         dof = int(case.dof.sum()) - 2
         price = LATE_PRICE + price_of_parameters(np.zeros(2), np.ones(2))
         # residuals of late rows have no chi-square
-        yield Scored(change, theta, sigma, np.nan, dof, found.score + price, found.x)
-
-
-def _no_words(theta: Array, sigma: Array) -> Wording:
-    return Wording("", "")
+        yield Scored(change, theta, np.zeros(2), np.nan, dof, found.score + price, found.x)
 
 
 def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:
@@ -127,6 +131,8 @@ def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:
     for one in found:
         if one.score > found[0].score + GAP:
             break
+        if any(_is_part(other, one) for other in kept):
+            continue
         equal = next((i for i, other in enumerate(kept) if _is_equal(one, other)), None)
         if equal is None:
             kept.append(one)
@@ -140,9 +146,22 @@ def _rank(one: Scored, names: list[str]) -> int:
     return names.index(one.change.cause) if one.change.cause in names else len(names)
 
 
+def _is_part(one: Scored, other: Scored) -> bool:
+    """Return whether a pair of outliers contains an explanation with a better score: the second row is not needed."""
+    return (
+        other.change.cause == "outliers"
+        and bool(one.change.station)
+        and (set(one.change.station) <= set(other.change.station) and one.change.cause != "outliers")
+    )
+
+
 def _is_equal(one: Scored, other: Scored) -> bool:
     """Return whether two explanations are the same statement about the same stations."""
-    if (one.change.cause, one.change.station, one.change.kind) == (other.change.cause, other.change.station, other.change.kind):
+    if (one.change.cause, one.change.station, one.change.kind) == (
+        other.change.cause,
+        other.change.station,
+        other.change.kind,
+    ):
         return not (one.change.members and one.change.members != other.change.members) or one.change.cause == "noise"
     same = set(one.change.station) == set(other.change.station) and one.change.station
     return bool(same and one.dof == other.dof and abs(one.cost - other.cost) < _EQUAL * (1.0 + one.cost))

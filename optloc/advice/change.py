@@ -74,6 +74,8 @@ class Change:
         Number of a station whose position has an unknown error, d more parameters; -1 for none.
     starts : tuple of tuple of float
         Values of the parameters from which the fit starts. Empty: the fit starts without the affected rows.
+    x : array (K, size), optional
+        Unknowns from which the fit starts, instead of a search.
     alternatives : float
         Number of alternatives among which data choose this one.
     extra : int
@@ -98,6 +100,7 @@ class Change:
     columns: tuple[Column, ...] = ()
     moved: int = -1
     starts: tuple[tuple[float, ...], ...] = ()
+    x: Array | None = None
     alternatives: float = 1.0
     extra: int = 0
     levels: bool = False

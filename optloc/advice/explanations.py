@@ -30,8 +30,8 @@ class Explanation:
     changes: Callable[[Case, Suspects], Iterator[Change]]
 
 
-# Prices by how often a cause is seen: odds of 3, 10 and 30 to 1.
-_COMMON, _USUAL, _RARE = 2.2, 4.6, 6.8
+# Prices by how often a cause is seen: odds of 3, 10, 30 and 100 to 1.
+_COMMON, _USUAL, _RARE, _SELDOM = 2.2, 4.6, 6.8, 9.2
 
 LATE_PRICE = _USUAL
 """Price of late signals, which are a distribution of errors and no change of values."""
@@ -43,15 +43,18 @@ EXPLANATIONS: Registry[Explanation] = Registry(
         "offset": Explanation("constant error of one station", _USUAL, station_errors.offsets),
         "sign-station": Explanation("opposite sign of one station", _RARE, station_errors.signs),
         "scale": Explanation("wrong scale of one station", _RARE, station_errors.scales),
+        "step": Explanation("offset of one station from some time on", _RARE, station_errors.steps),
+        "rotation": Explanation("axes of one station are turned in space", _USUAL, station_errors.rotations),
         "drift": Explanation("drift of one station", _RARE, station_errors.drifts),
         "period": Explanation("one station is off by whole periods", _RARE, station_errors.periods),
         "swapped": Explanation("two stations are exchanged", _RARE, station_errors.exchanges),
         "reference": Explanation("another reference station", _RARE, station_errors.references),
         "moved": Explanation("one station is at another position", _RARE, station_errors.moves),
-        "outlier": Explanation("one or two wrong rows", _USUAL, rows_and_noise.outliers),
+        "outlier": Explanation("one wrong row", _USUAL, rows_and_noise.single_outliers),
+        "outliers": Explanation("two wrong rows", 2.0 * _USUAL, rows_and_noise.pairs_of_outliers),
         "noise": Explanation("larger noise of a kind or station", _USUAL, rows_and_noise.levels),
         "unit": Explanation("another unit of the values", _USUAL, readings.units),
-        "coordinate-unit": Explanation("another unit of the coordinates", _RARE, readings.coordinate_units),
+        "coordinate-unit": Explanation("another unit of the coordinates", _SELDOM, readings.coordinate_units),
         "sense": Explanation("another sense of azimuths", _COMMON, readings.senses),
         "declination": Explanation("all azimuths are turned", _USUAL, readings.declinations),
         "sign": Explanation("opposite sign of all values", _COMMON, readings.signs),

@@ -18,7 +18,7 @@ from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
 from optloc.linear.equalities import Equalities
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import linearise
+from optloc.linear.normal import Normal, linearise
 from optloc.model_checks.score import descend, fit_anywhere
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
@@ -112,7 +112,7 @@ def _relocated(case: Case, lanes: Problem, changes: Sequence[Change], theta: Arr
     return replace(lanes, stations=replace(lanes.stations, position=all_places.reshape(-1, *core)))
 
 
-def fit(case: Case, changes: Sequence[Change], start: Array | None = None) -> Fits:
+def fit(case: Case, changes: Sequence[Change]) -> Fits:
     """Return the best fit of each change.
 
     A change with parameters and without starts affects a few rows: its fit starts at the fit without these rows.
@@ -123,24 +123,23 @@ def fit(case: Case, changes: Sequence[Change], start: Array | None = None) -> Fi
         The problem.
     changes : sequence of Change
         E changes.
-    start : array (E, K, size), optional
-        Positions from which the fits start; by default the fix, and a search.
     """
-    d, k = case.base.dimension, len(case.times)
+    d = case.base.dimension
     width = max(1, *(change.size(d) for change in changes))
     lane = [e for e, change in enumerate(changes) for _ in range(max(1, len(change.starts)))]
     theta = np.zeros((len(lane), width))
     for i, given in enumerate(s for change in changes for s in (change.starts or ((),))):
         theta[i, : len(given)] = given
     many = [changes[e] for e in lane]
-    x = np.broadcast_to(case.x, (len(many), *case.x.shape)) if start is None else start[lane]
-    found = _search(case, [_without(change) for change in many], theta, x)
+    found = np.stack([case.x if change.x is None else change.x for change in many])
+    blind = [i for i, change in enumerate(many) if change.x is None]
+    if blind:
+        found[blind] = _search(case, [_without(many[i]) for i in blind], theta[blind], found[blind])
     theta = np.where([[not change.starts] for change in many], _first_values(case, many, theta, found), theta)
     done = _descend(case, many, theta, found)
     total = done.cost.sum(-1)
     order = np.lexsort((total, lane))
     first = order[np.unique(np.asarray(lane)[order], return_index=True)[1]]
-    assert len(first) == len(changes) and k == done.cost.shape[1]
     return done.take(first)
 
 
@@ -211,7 +210,7 @@ def _dense(problem: Problem, shared: Array, local: Array) -> Array:
     return out
 
 
-def _joined(problem: Problem, equations) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+def _joined(problem: Problem, equations: Normal) -> tuple[Array, Array]:
     """Return the information (L, size, size) and the right side (L, size) of all unknowns."""
     n, length, k = problem.layout.n_shared, problem.layout.n_local, problem.epochs
     size, count = n + k * length, len(equations.shared)

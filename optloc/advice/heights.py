@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,15 @@ def heights(case: Case, suspects: Suspects) -> Iterator[Change]:
     free = tuple(c for c in base.constraints if not (isinstance(c, Band) and is_exact(c) and c.kind == "height"))
     if len(free) < len(base.constraints):
         yield Change("height", _height_words, base=replace(base, constraints=free), extra=k)
+    elif any(isinstance(c, Band) and is_exact(c) for c in base.constraints):
+        count = sum(isinstance(c, Band) and is_exact(c) for c in base.constraints)
+        words = partial(_constraint_words, ", ".join(dict.fromkeys(c.name for c in base.constraints)))
+        yield Change("constraint", words, base=replace(base, constraints=()), extra=k * count)
+
+
+def _constraint_words(names: str, theta: Array, sigma: Array) -> Wording:
+    seen = f"the values fit without the constraints ({names}), but no position was found that meets both"
+    return Wording(seen, "check their values")
 
 
 def _plain(base: Problem) -> bool:
@@ -57,6 +67,6 @@ def _slant_words(theta: Array, sigma: Array) -> Wording:
 
 def _height_words(theta: Array, sigma: Array) -> Wording:
     seen = "the values fit without the stated height of the target"
-    return Wording(seen, "check the height: it is above the ellipsoid, not above the sea, and stations need heights, too")
-
-
+    return Wording(
+        seen, "check the height: it is above the ellipsoid, not above the sea, and stations need heights, too"
+    )

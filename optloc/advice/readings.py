@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Column, Wording
+from optloc.advice.change import Case, Change, Column, Wording, Words
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import bias_lines, size_text
 from optloc.base.types import Array, CompassRows
@@ -25,6 +25,8 @@ _MAX_PAIRS = 3
 _COORDINATE_UNITS = ("km", "cm", "mm", "ft")
 # Speeds that may be confused, m/s: light, sound in air and in water.
 _SPEEDS = (SPEED_OF_LIGHT, 343.0, 1500.0)
+# Relative difference of equal units.
+_SAME_UNIT = 1e-6
 # Rounding of angles, rad: full turns are no more than full turns.
 _ROUNDED = 1e-3
 # Starts of the scale of all lengths: a speed that is wrong by up to a factor of four.
@@ -41,16 +43,16 @@ def units(case: Case, suspects: Suspects) -> Iterator[Change]:
     for group in groups:
         rows = np.any([case.rows_of(kind) for kind in group], axis=0)
         for ratio, (stated, meant) in ratios.items():
-            words = partial(_unit_words, group, stated, meant, ratio)
-            yield from _read(case, rows, ratio, words, "unit", len(ratios) * len(groups))
+            words = partial(_unit_words, case, group, stated, meant, ratio)
+            yield from _read(case, rows, ratio, words, len(ratios) * len(groups))
     angles = tuple(kind for kind in case.kinds if MODELS[kind].quantity == "angle")
     rows = case.rows_where("angle")
     for stated, meant, ratio in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)) if angles else ():
         words = partial(_angle_words, angles, stated, meant)
-        yield from _read(case, rows, ratio, words, "unit", 2)
+        yield from _read(case, rows, ratio, words, 2)
 
 
-def _read(case: Case, rows: Array, ratio: float, words, cause: str, choices: float) -> Iterator[Change]:  # type: ignore[no-untyped-def]
+def _read(case: Case, rows: Array, ratio: float, words: Words, choices: float) -> Iterator[Change]:
     """Yield values times a ratio, with noise times this ratio, and with the stated noise.
 
     The values of compass bearings turn about north.
@@ -64,9 +66,10 @@ def _read(case: Case, rows: Array, ratio: float, words, cause: str, choices: flo
             reading = np.where(case.present, ratio * (np.abs(_readings(case)) - _ROUNDED), 0.0)[:, case.part(i)]
             if np.abs(reading).max() > 2.0 * np.pi:
                 return
-    yield Change(cause, words, factor=factor, shift=shift, alternatives=choices)
+    yield Change("unit", words, factor=factor, shift=shift, alternatives=choices)
     # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
-    yield Change(cause, words, factor=factor, shift=shift, spread=np.where(rows, 1.0 / ratio, 1.0), alternatives=choices)
+    spread = np.where(rows, 1.0 / ratio, 1.0)
+    yield Change("unit", words, factor=factor, shift=shift, spread=spread, alternatives=choices)
 
 
 def _readings(case: Case) -> Array:
@@ -91,14 +94,33 @@ def _ratios() -> dict[float, tuple[str, str]]:
 
 
 def _unit_words(
-    kinds: tuple[str, ...], stated: str, meant: str, ratio: float, theta: Array, sigma: Array
+    case: Case, kinds: tuple[str, ...], stated: str, meant: str, ratio: float, theta: Array, sigma: Array
 ) -> Wording:
+    written = case.base.written
+    sizes = {abs(written.units.get(kind, 1.0)) for kind in kinds} if written is not None else set()
+    if written is not None and len(sizes) == 1:
+        return _words_of_file(kinds, sizes.pop(), ratio, written.speed or SPEED_OF_LIGHT)
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     what = " and ".join(kinds)
     pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
     seen = f"the {what} values fit in {meant} instead of the stated {stated}, {ratio:.4g} times as large"
     advice = f"state their unit; by the ratio it may be {' or '.join(pairs[:_MAX_PAIRS])}"
     return Wording(seen, advice, f'unit = "{meant}"\n')
+
+
+def _words_of_file(kinds: tuple[str, ...], size: float, ratio: float, speed: float) -> Wording:
+    """Return the text about a unit whose size is `ratio` times the size in the file, m."""
+    table = {name: own * (speed if name in _TIMES else 1.0) for name, own in UNITS["length"].items()}
+    stated, meant = (
+        next((name for name, own in table.items() if abs(own / wanted - 1.0) < _SAME_UNIT), "")
+        for wanted in (size, size * ratio)
+    )
+    what = " and ".join(kinds)
+    if not meant:
+        seen = f"the {what} values fit in a unit that is {ratio:.4g} times as large as the stated one"
+        return Wording(seen, "check the unit of the values and of the stations")
+    seen = f"the {what} values fit in {meant} instead of the stated {stated}, {ratio:.4g} times as large"
+    return Wording(seen, "state their unit", f'unit = "{meant}"\n', f"--unit {meant}")
 
 
 def _angle_words(kinds: tuple[str, ...], stated: str, meant: str, theta: Array, sigma: Array) -> Wording:
@@ -113,15 +135,21 @@ def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
         if model.ranges != (1, -1) and not model.emission and kind != "rss_difference":
             continue
         difference = not model.emission
-        words = partial(_sign_words, kind, difference)
+        turned = case.base.written is not None and case.base.written.units.get(kind, 1.0) < 0.0
+        words = partial(_sign_words, kind, difference, turned)
         yield Change("sign", words, factor=np.where(case.rows_of(kind), -1.0, 1.0))
 
 
-def _sign_words(kind: str, difference: bool, theta: Array, sigma: Array) -> Wording:
+def _sign_words(kind: str, difference: bool, turned: bool, theta: Array, sigma: Array) -> Wording:
     seen = f"the {kind} values fit with the opposite sign"
     if difference:
-        advice = "state which station is farther if the number is positive (remove the key if it is there)"
-        return Wording(seen, advice, 'positive = "b-farther"\n')
+        key = "a-farther" if turned else "b-farther"
+        return Wording(
+            seen,
+            "state which station is farther if the number is positive",
+            f'positive = "{key}"\n',
+            f"--positive {key}",
+        )
     return Wording(f"{seen}: the counters count down to zero", "write a minus before each value")
 
 
@@ -131,19 +159,18 @@ def senses(case: Case, suspects: Suspects) -> Iterator[Change]:
     if "azimuth" not in case.kinds:
         return
     compass = any(isinstance(block, CompassRows) and block.kind == "azimuth" for block in case.base.rows)
-    half, key = np.pi / 2, "azimuth = "
+    half, east, north = np.pi / 2, 'azimuth = "east-counterclockwise"\n', 'azimuth = "north-counterclockwise"\n'
     if compass:
         # the reading r was taken as pi/2 - r
-        yield _sense(rows, "compass", -1.0, half, "as angles from east, counter-clockwise", f'{key}"east-counterclockwise"\n')
-        yield _sense(
-            rows, "anticlockwise", -1.0, np.pi, "counter-clockwise from north", f'{key}"north-counterclockwise"\n'
-        )
+        yield _sense(rows, "compass", -1.0, half, "as angles from east, counter-clockwise", east)
+        yield _sense(rows, "anticlockwise", -1.0, np.pi, "counter-clockwise from north", north)
     else:
-        yield _sense(rows, "compass", -1.0, half, "as compass bearings", f'{key}"north-clockwise"\n')
-        yield _sense(rows, "anticlockwise", 1.0, half, "counter-clockwise from north", f'{key}"north-counterclockwise"\n')
-    yield _sense(
-        rows, "opposite", 1.0, np.pi, "from the target to the station, half a turn more", 'correction = "180 deg"\n'
-    )
+        yield _sense(rows, "compass", -1.0, half, "as compass bearings", 'azimuth = "north-clockwise"\n')
+        yield _sense(rows, "anticlockwise", 1.0, half, "counter-clockwise from north", north)
+        degrees = 'unit = "deg"\nazimuth = "north-clockwise"\n'
+        yield _sense(rows, "compass", -np.pi / 180.0, half, "as compass bearings in degrees", degrees)
+    turned = "from the target to the station, half a turn more"
+    yield _sense(rows, "opposite", 1.0, np.pi, turned, 'correction = "180 deg"\n')
 
 
 def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml: str) -> Change:
@@ -152,7 +179,7 @@ def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml:
         partial(_sense_words, how, toml),
         factor=np.where(rows, factor, 1.0),
         shift=np.where(rows, shift, 0.0),
-        alternatives=3,
+        alternatives=4,
     )
 
 
@@ -191,8 +218,24 @@ def _speed_words(case: Case, kinds: list[str], theta: Array, sigma: Array) -> Wo
     ratio = 1.0 / (1.0 + theta[0])
     seen = f"the lengths fit if all are multiplied by {ratio:.6g} (± {100.0 * sigma[0] / (1.0 + theta[0]):.2g} %)"
     advice = f"check the speed of the wave, {ratio:.5g} times the stated one, and the unit; until then, model the error"
+    written = case.base.written
+    if (
+        written is not None
+        and written.speed
+        and all(_is_time(written.units.get(kind, 1.0), written.speed) for kind in kinds)
+    ):
+        speed = written.speed * ratio
+        seen = f"the times fit with a wave speed of {speed:.6g} m/s instead of {written.speed:.6g} m/s"
+        return Wording(
+            seen, "check the speed of the wave", f"propagation_speed = {speed!r}\n", f"--wave-speed '{speed:.9g} m/s'"
+        )
     lines = bias_lines(case, "scale", "kind", kinds[0]) if len(kinds) == 1 else ""
     return Wording(seen, advice, lines)
+
+
+def _is_time(size: float, speed: float) -> bool:
+    """Return whether a unit of lengths is a time that is multiplied by the speed."""
+    return any(abs(abs(size) / (speed * UNITS["length"][name]) - 1.0) < _SAME_UNIT for name in _TIMES)
 
 
 def coordinate_units(case: Case, suspects: Suspects) -> Iterator[Change]:
@@ -201,7 +244,7 @@ def coordinate_units(case: Case, suspects: Suspects) -> Iterator[Change]:
     if case.base.frame.geodetic or not case.present[:, case.rows_where("length")].any():
         return
     sizes = [UNITS["length"][unit] for unit in _COORDINATE_UNITS]
-    factors = {unit: size for unit, size in zip(_COORDINATE_UNITS, sizes, strict=True)}
+    factors = dict(zip(_COORDINATE_UNITS, sizes, strict=True))
     for unit, size in factors.items():
         for factor, stated, meant in ((size, "m", unit), (1.0 / size, unit, "m")):
             words = partial(_coordinate_words, stated, meant, factor)
@@ -209,14 +252,14 @@ def coordinate_units(case: Case, suspects: Suspects) -> Iterator[Change]:
 
 
 def _coordinate_words(stated: str, meant: str, factor: float, theta: Array, sigma: Array) -> Wording:
-    seen = f"the values fit if the coordinates of the stations are {factor:.4g} times as large, {meant} instead of {stated}"
+    seen = f"the values fit with coordinates of stations in {meant} instead of {stated}, {factor:.4g} times as large"
     return Wording(seen, "state the unit of the stations", f'[stations]\nunit = "{meant}"\n')
 
 
 def swapped_coordinates(case: Case, suspects: Suspects) -> Iterator[Change]:
     """Yield exchanged latitudes and longitudes of all stations."""
     stations, frame = case.base.stations, case.base.frame
-    if not frame.geodetic or stations.position.ndim > 3 or stations.axes is not None and stations.axes.ndim > 4:
+    if not frame.geodetic or stations.position.ndim > 3 or (stations.axes is not None and stations.axes.ndim > 4):
         return
     lat, lon, height = frame.to_geodetic(stations.position)
     if np.abs(lon).max() > 90.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -27,11 +27,20 @@ _LEVELS = tuple((1.5 * 1.5**i) for i in range(14))
 _FEW = 6
 
 
-def outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
-    """Yield single rows without which the others may fit, and pairs of such rows."""
-    rows = _worst_rows(case)
+def single_outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield single rows without which the others may fit."""
+    yield from _without_rows(case, [(row,) for row in _worst_rows(case)])
+
+
+def pairs_of_outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield pairs of rows without which the others may fit."""
+    yield from _without_rows(case, [*combinations(_worst_rows(case)[:_PAIRED], 2)])
+
+
+def _without_rows(case: Case, sets: Sequence[tuple[tuple[int, int], ...]]) -> Iterator[Change]:
+    """Yield unknown errors of sets of rows; a row has the number of its epoch and its number there."""
     many = int(case.present.sum())
-    for pair in [*((row,) for row in rows), *combinations(rows[:_PAIRED], 2)]:
+    for pair in sets:
         columns = []
         for epoch, row in pair:
             mark = np.zeros(case.present.shape)
@@ -165,6 +174,8 @@ def _densities(residual: Array, delay: float) -> tuple[Array, Array]:
 
 def late_words(fit: LateFit, theta: Array, sigma: Array) -> Wording:
     """Return the text about late signals."""
-    seen = f"late signals would explain the misfit: {fit.share:.0%} of the rows, late by {fit.delay:.3g} sigma on average"
+    seen = (
+        f"late signals would explain the misfit: {fit.share:.0%} of the rows, late by {fit.delay:.3g} sigma on average"
+    )
     advice = "use a loss for late rows, or remove the receivers without a line of sight"
     return Wording(seen, advice, "", "--late-from-data")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
@@ -10,10 +11,11 @@ import numpy as np
 
 from optloc.advice.change import Case, Change, Column, Wording
 from optloc.advice.suspects import Suspects
-from optloc.advice.wording import bias_lines, size_text, station_words, unit_of
+from optloc.advice.wording import bias_lines, quoted, size_text, station_words, unit_of
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
+from optloc.problem.bias import family
 
 # Stations whose other errors are tried: the best few without whose rows the cost is least.
 _TRIED = 5
@@ -22,6 +24,10 @@ _PAIRS = 8
 # Periods of codes and clocks, s: GPS C/A code, GPS data bit, second. Their multiples up to the third are tried.
 _PERIODS = {"1 ms, the period of a code": 1e-3, "20 ms": 2e-2, "1 s": 1.0}
 _MULTIPLES = 3
+# Least number of times of a run for steps, the number of times at which a step may start, and of stations with steps.
+_STEP_TIMES, _CUTS, _STEPPED = 6, 12, 2
+# Number of angles of a rotation in space.
+_ANGLES = 3
 
 
 def offsets(case: Case, suspects: Suspects) -> Iterator[Change]:
@@ -37,7 +43,11 @@ def offsets(case: Case, suspects: Suspects) -> Iterator[Change]:
 def _words_of_kind(case: Case, kind: str, theta: Array, sigma: Array) -> Wording:
     size = size_text(theta[0], sigma[0], unit_of(kind))
     seen = f"an offset of all {kind} rows of {size} would explain the misfit"
-    return Wording(seen, "check the clock and the zero of the instrument; until then, model the error", bias_lines(case, "offset", "kind", kind))
+    return Wording(
+        seen,
+        "check the clock and the zero of the instrument; until then, model the error",
+        bias_lines(case, "offset", "kind", kind),
+    )
 
 
 def scales(case: Case, suspects: Suspects) -> Iterator[Change]:
@@ -51,6 +61,59 @@ def drifts(case: Case, suspects: Suspects) -> Iterator[Change]:
         yield from _of_form(case, suspects, "drift", "adds")
 
 
+def steps(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield offsets of single stations that start within a run."""
+    times = np.unique(case.when[case.present])
+    if len(times) < _STEP_TIMES:
+        return
+    cuts = times[np.unique(np.linspace(1, len(times) - 1, min(len(times) - 1, _CUTS)).round().astype(int))]
+    for station, kind in suspects.first(_STEPPED):
+        own = case.coefficients("station", "offset", kind, case.names[station])
+        for cut in cuts.tolist():
+            column = own * (case.when >= cut)
+            words = partial(_step_words, case, kind, case.names[station], cut)
+            yield Change(
+                "step",
+                words,
+                (case.names[station],),
+                columns=(Column("adds", column),),
+                starts=((0.0,),),
+                x=suspects.start(station, kind),
+                alternatives=suspects.count * len(cuts),
+                kind=kind,
+            )
+
+
+def _step_words(case: Case, kind: str, name: str, cut: float, theta: Array, sigma: Array) -> Wording:
+    size = size_text(theta[0], sigma[0], unit_of(kind))
+    seen = f"a step of station {name} of {size} from t = {case.origin + cut:.6g} s on would explain the misfit"
+    return Wording(seen, "split the run there, or give the later rows another station name")
+
+
+def rotations(case: Case, suspects: Suspects) -> Iterator[Change]:
+    """Yield turns of the axes of single stations in space, for a run of shared unknowns or one epoch."""
+    base = case.base
+    if base.dimension != 3 or len(case.times) > 1:
+        return
+    angles = np.any(
+        [case.rows_of(kind) for kind in case.kinds if MODELS[kind].axes] or [case.present[0] & False], axis=0
+    )
+    for station in case.stations:
+        # three angles need at least four rows
+        if int(case.present[:, case.rows_at(station) & angles].sum()) > _ANGLES:
+            name = case.names[station]
+            bias = family(base.rows, case.names, "rotation that is tested", form="rotation", members=(name,))
+            words = partial(_rotation_words, case, name)
+            other = replace(base, biases=(*base.biases, bias))
+            yield Change("rotation", words, (name,), base=other, extra=_ANGLES, alternatives=len(case.stations))
+
+
+def _rotation_words(case: Case, name: str, theta: Array, sigma: Array) -> Wording:
+    lines = f'[[biases]]\nname = "rotation"\nform = "rotation"\nper = "station"\nmembers = [{quoted(name)}]\n'
+    seen = f"a rotation of the axes of station {name} would explain the misfit"
+    return Wording(seen, "check its orientation; until then, model the error", lines)
+
+
 def _of_form(case: Case, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
     for station, kind in suspects.first(_TRIED):
         if form == "scale" and MODELS[kind].period is not None:
@@ -59,7 +122,12 @@ def _of_form(case: Case, suspects: Suspects, form: str, enters: str) -> Iterator
         column = own * (case.when if form == "drift" else np.ones_like(case.when))
         words = partial(station_words, case, form, kind, case.names[station])
         yield Change(
-            form, words, (case.names[station],), columns=(Column(enters, column),), alternatives=suspects.count  # type: ignore[arg-type]
+            form,
+            words,
+            (case.names[station],),
+            columns=(Column(enters, column),),  # type: ignore[arg-type]
+            x=suspects.start(station, kind),
+            alternatives=suspects.count,
         )
 
 
@@ -73,7 +141,12 @@ def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
             continue  # the sign of all rows is another explanation
         words = partial(_sign_words, case, case.names[station], kind)
         yield Change(
-            "sign-station", words, (case.names[station],), factor=np.where(rows, -1.0, 1.0), alternatives=suspects.count
+            "sign-station",
+            words,
+            (case.names[station],),
+            factor=np.where(rows, -1.0, 1.0),
+            x=suspects.start(station, kind),
+            alternatives=suspects.count,
         )
 
 
@@ -99,7 +172,7 @@ def periods(case: Case, suspects: Suspects) -> Iterator[Change]:
                 words = partial(_period_words, case, change.station[0], kind, count, name, count * length)
                 choices = suspects.count * len(table) * (2 * _MULTIPLES if MODELS[kind].quantity == "length" else 1)
                 shift = -count * length * column
-                yield Change("period", words, change.station, shift=shift, alternatives=choices)
+                yield Change("period", words, change.station, shift=shift, x=change.x, alternatives=choices)
 
 
 def _period_words(
@@ -136,7 +209,7 @@ def _exchange_words(names: tuple[str, str], theta: Array, sigma: Array) -> Wordi
 def references(case: Case, suspects: Suspects) -> Iterator[Change]:
     """Yield other reference stations of differences that all have the same second station."""
     place = case.base.stations.position
-    a, b = case.ends
+    _, b = case.ends
     used = case.present.any(0)
     if not used.all() or len(set(b[used].tolist())) != 1 or b[used][0] < 0 or place.ndim > 3 or place.shape[-3] > 1:
         return
@@ -152,7 +225,7 @@ def references(case: Case, suspects: Suspects) -> Iterator[Change]:
 
 def _reference_words(name: str, stated: str, theta: Array, sigma: Array) -> Wording:
     seen = f"the differences fit with the reference station {name} instead of {stated}"
-    return Wording(seen, f"state b = \"{name}\" in these rows, and remove the row of {name}")
+    return Wording(seen, f'state b = "{name}" in these rows, and remove the row of {name}')
 
 
 def moves(case: Case, suspects: Suspects) -> Iterator[Change]:
@@ -160,13 +233,19 @@ def moves(case: Case, suspects: Suspects) -> Iterator[Change]:
     place = case.base.stations.position
     if place.ndim > 3 or place.shape[-3] > 1:
         return
-    for station in dict.fromkeys(s for s, _ in suspects.first(_TRIED)):
+    for station, kind in {s: (s, kind) for s, kind in reversed(suspects.first(_TRIED))}.values():
         if int(case.present[:, case.rows_at(station)].sum()) < case.base.dimension + 2:
             continue
         words = partial(_move_words, case, station)
         start = ((0.0,) * case.base.dimension,)
         yield Change(
-            "moved", words, (case.names[station],), moved=station, starts=start, alternatives=len(case.stations)
+            "moved",
+            words,
+            (case.names[station],),
+            moved=station,
+            starts=start,
+            x=suspects.start(station, kind),
+            alternatives=len(case.stations),
         )
 
 

@@ -1,4 +1,4 @@
-"""The stations of a problem, ordered by the cost without their rows: the first filter of explanations by one station."""
+"""Stations ordered by the cost without their rows: the first filter of explanations by one station."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from optloc.advice.change import Case, Change, Column
 from optloc.advice.fits import Fits, fit
 from optloc.advice.wording import station_words
+from optloc.base.types import Array
 
 
 @dataclass(frozen=True)  # without slots, because the cached properties need `__dict__`
@@ -26,8 +27,8 @@ class Suspects:
     case: Case
 
     @cached_property
-    def offsets(self) -> tuple[Change, ...]:
-        """Return the offsets of all channels."""
+    def _stated(self) -> tuple[Change, ...]:
+        """Return the offsets of all channels, without starts."""
         case, out = self.case, []
         for station, kind in self.channels:
             own = case.coefficients("station", "offset", kind, case.names[station])
@@ -38,7 +39,13 @@ class Suspects:
             words = partial(station_words, case, "offset", kind, case.names[station])
             out.append(
                 Change(
-                    "offset", words, (case.names[station],), columns=(column,), starts=starts, alternatives=self.count, kind=kind
+                    "offset",
+                    words,
+                    (case.names[station],),
+                    columns=(column,),
+                    starts=starts,
+                    alternatives=self.count,
+                    kind=kind,
                 )
             )
         return tuple(out)
@@ -58,27 +65,36 @@ class Suspects:
         return max(1, len(self.channels))
 
     @cached_property
-    def fits(self) -> Fits:
-        """Return the fits of all offsets."""
-        return fit(self.case, self.offsets)
-
-    @cached_property
     def without(self) -> Fits:
         """Return the fits without the rows of each channel."""
         changes = [
             change
             if change.starts
             else replace(change, weight=np.where(change.columns[0].coefficient != 0.0, 0.0, 1.0), columns=())
-            for change in self.offsets
+            for change in self._stated
         ]
         return fit(self.case, changes)
 
     @cached_property
+    def offsets(self) -> tuple[Change, ...]:
+        """Return the offsets of all channels, each with a start."""
+        return tuple(replace(one, x=x) for one, x in zip(self._stated, self.without.x, strict=True))
+
+    @cached_property
+    def fits(self) -> Fits:
+        """Return the fits of all offsets."""
+        return fit(self.case, self.offsets)
+
+    @cached_property
     def order(self) -> tuple[int, ...]:
         """Return the numbers of the channels, least cost without their rows first."""
-        if not self.offsets:
+        if not self._stated:
             return ()
         return tuple(np.argsort(self.without.cost.sum(-1), kind="stable").tolist())
+
+    def start(self, station: int, kind: str) -> Array:
+        """Return the unknowns (K, size) without the rows of a channel."""
+        return np.asarray(self.without.x[self.channels.index((station, kind))])
 
     def first(self, count: int) -> list[tuple[int, str]]:
         """Return the first channels in this order."""

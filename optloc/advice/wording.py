@@ -61,3 +61,8 @@ def station_words(case: Case, form: str, kind: str, name: str, theta: Array, sig
     return Wording(
         seen, "check this channel; until then, model the error", bias_lines(case, form, "station", kind, (name,))
     )
+
+
+def no_words(theta: Array, sigma: Array) -> Wording:
+    """Return no text, for a change that is compared and never reported."""
+    return Wording("", "")

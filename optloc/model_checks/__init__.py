@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from optloc.base.faces import exported
 
 if TYPE_CHECKING:
-    from optloc.model_checks.advice import advise as advise, explained as explained
     from optloc.model_checks.cause import Advice as Advice
     from optloc.model_checks.coplanar import distance_from_plane as distance_from_plane
     from optloc.model_checks.determine import determined as determined
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
         refuse_impossible as refuse_impossible,
         suspicious_values as suspicious_values,
     )
+    from optloc.model_checks.single_error import explained as explained
 
 if not TYPE_CHECKING:
     __getattr__, __dir__, __all__ = exported(__name__, __file__)
