@@ -204,7 +204,7 @@ def scores(draw: Draw) -> list[Scored]:
     out = [Scored("none", (), cost, cost)]
     e, r = data.z.shape
     dof = data.z.size - e * (fit.free + fit.emission)
-    out.append(_noise(cost, dof))
+    out.append(_noise(data, cost, dof))
     if cost < dof + _FITS:
         return sorted(out, key=lambda one: one.score)
     for change in _readings(data)[1:]:
@@ -239,12 +239,18 @@ def _level(data: Data, truth: Array) -> Array:
     return np.column_stack([truth[:, :2], np.full(len(truth), data.level)])
 
 
-def _noise(cost: float, dof: int) -> Scored:
-    """Return the score of understated noise: one factor of all sigmas, from the redundancy."""
+def _noise(data: Data, cost: float, dof: int) -> Scored:
+    """Return the score of understated noise: one factor of all sigmas.
+
+    The rows that fix the position are no evidence against a larger noise, until it is as large as the array.
+    """
     if dof < 1:
         return Scored("noise", (), np.inf, np.inf)
+    span = float(np.sqrt(((data.place - data.place.mean(0)) ** 2).sum(1)).max())
+    widest = max(1.0, {"azimuth": np.pi, "groa": 10.0, "range_rate": 500.0}.get(data.kind[0], span) / data.sigma[0])
     square = max(cost / dof, 1.0)
-    found = cost / square + dof * np.log(square)
+    fixed = (data.z.size - dof) * np.log(min(square, widest**2))
+    found = cost / square + data.z.size * np.log(square) - fixed
     return Scored("noise", (), found + NOISE, found)
 
 
@@ -285,8 +291,10 @@ def _rows_scored(data: Data, truth: Array, x0: Array) -> list[Scored]:
     for row, gain in single.items():
         change = _row_change(data, (row,))
         out.append(Scored("outlier", change.stations, total + gain + change.price, total + gain))
-    ranked = sorted(single, key=single.get)[:6]
-    for one, two in combinations(ranked, 2):
+    ranked = sorted(single, key=single.get)
+    first = list({row // r: row for row in reversed(ranked)}.values())
+    pairs = {*combinations(sorted(ranked[:5]), 2), *combinations(sorted(first), 2)}
+    for one, two in sorted(pairs):
         change = _row_change(data, (one, two))
         if one // r != two // r:
             found = total + single[one] + single[two]
@@ -315,7 +323,10 @@ def _suspicious(data: Data, x0: Array, truth: Array) -> list[int]:
             q, _ = np.linalg.qr(jx[0, epoch])
             columns = columns - (columns @ q) @ q.T
             gain[epoch] = (columns @ r[0, epoch]) ** 2 / np.maximum((columns**2).sum(1), 1e-12)
-        out += np.argsort(-gain.ravel(), kind="stable")[:_RANKED].tolist()
+        # a gross error hides others in its epoch only
+        best = np.argsort(-gain, axis=1, kind="stable")[:, :3] + gain.shape[1] * np.arange(len(gain))[:, None]
+        ranked = sorted(best.ravel().tolist(), key=lambda row: -gain.flat[row])
+        out += [*ranked[:_RANKED], *(row for row in best[:, 0].tolist() if gain.flat[row] > 9.0)]
     return list(dict.fromkeys(out))
 
 

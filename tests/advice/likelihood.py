@@ -98,30 +98,15 @@ class Fit:
         return r - one * ((one * r).sum(-1, keepdims=True) / total)
 
     def run(self, x: Array, theta: Array, steps: int = _STEPS) -> tuple[Array, Array, Array]:
-        """Return positions, parameters and costs (B,) after damped Gauss-Newton steps."""
-        b, _e, _ = x.shape
-        damping = np.full(b, 1e-3)
+        """Return positions, parameters and costs (B,) after damped Gauss-Newton steps.
+
+        Without parameters the epochs share nothing, and each has its own damping.
+        """
         r = self.whitened(x, theta)
-        cost = (r**2).sum((1, 2))
+        cost = self._costs(r)
+        damping = np.full(cost.shape, 1e-3)
         for number in range(steps):
-            jx, jt = self.derivatives(x, theta, r)
-            a = np.einsum("berk,berl->bekl", jx, jx)
-            g = np.einsum("berk,ber->bek", jx, r)
-            scale = np.einsum("bekk->bek", a)
-            a = a + (damping[:, None, None] * scale + 1e-300 + 1e-12 * scale.max(-1, keepdims=True))[
-                ..., None
-            ] * np.eye(self.free)
-            if self.q:
-                c = np.einsum("berk,berq->bekq", jx, jt)
-                both = np.linalg.solve(a, np.concatenate([g[..., None], c], -1))
-                s = np.einsum("berp,berq->bpq", jt, jt) * (1.0 + damping[:, None, None] * np.eye(self.q))
-                s = s - np.einsum("bekp,bekq->bpq", c, both[..., 1:])
-                h = np.einsum("berq,ber->bq", jt, r) - np.einsum("bekq,bek->bq", c, both[..., 0])
-                s = s + (1e-300 + 1e-12 * np.einsum("bqq->bq", s).max(-1))[:, None, None] * np.eye(self.q)
-                dt = np.linalg.solve(s, h[..., None])[..., 0]
-                dx = both[..., 0] - np.einsum("bekq,bq->bek", both[..., 1:], dt)
-            else:
-                dx, dt = np.linalg.solve(a, g[..., None])[..., 0], np.zeros((b, 0))
+            dx, dt = self._step(*self.derivatives(x, theta, r), r, damping)
             step = np.zeros_like(x)
             step[..., : self.free] = dx
             new_t = np.clip(theta + dt, -self.change.limit, self.change.limit)
@@ -129,22 +114,42 @@ class Fit:
             if self.change.form == "level":
                 new_x[..., self.d - 1] = new_t[:, 0, None]
             new_r = self.whitened(new_x, new_t)
-            new = (new_r**2).sum((1, 2))
+            new = self._costs(new_r)
             better = new < cost
             done = cost - np.where(better, new, cost) <= _DONE * cost + 1e-4
-            x, theta = (
-                np.where(better[:, None, None], new_x, x),
-                np.where(better[:, None], new_t, theta),
-            )
-            r, cost = np.where(better[:, None, None], new_r, r), np.where(better, new, cost)
+            x, r = np.where(better[..., None], new_x, x), np.where(better[..., None], new_r, r)
+            theta, cost = np.where(better[:, :1], new_t, theta), np.where(better, new, cost)
             damping = np.clip(np.where(better, damping / 5.0, damping * 8.0), 1e-12, 1e12)
             if (done & (better | (damping > 1e6))).all():
                 break
-            if number == _TRIED:
-                hopeless = cost > _HOPELESS * max(self.interest, 100.0)
-                if hopeless.all():
-                    break
-        return x, theta, cost
+            if number == _TRIED and (r**2).sum((1, 2)).min() > _HOPELESS * max(self.interest, 100.0):
+                break
+        return x, theta, (r**2).sum((1, 2))
+
+    def _costs(self, r: Array) -> Array:
+        """Return the costs (B, E) that decide about a step: of each epoch, or of all epochs if parameters join them."""
+        cost = (r**2).sum(-1)
+        return np.repeat(cost.sum(-1, keepdims=True), cost.shape[-1], -1) if self.q else cost
+
+    def _step(self, jx: Array, jt: Array, r: Array, damping: Array) -> tuple[Array, Array]:
+        """Return the damped steps of the positions (B, E, k) and of the parameters (B, q)."""
+        a = np.einsum("berk,berl->bekl", jx, jx)
+        g = np.einsum("berk,ber->bek", jx, r)
+        scale = np.einsum("bekk->bek", a)
+        # the last terms keep matrices of positions without information invertible
+        a = a + (damping[..., None] * scale + 1e-300 + 1e-12 * scale.max(-1, keepdims=True))[..., None] * np.eye(
+            self.free
+        )
+        if not self.q:
+            return np.linalg.solve(a, g[..., None])[..., 0], np.zeros((len(r), 0))
+        c = np.einsum("berk,berq->bekq", jx, jt)
+        both = np.linalg.solve(a, np.concatenate([g[..., None], c], -1))
+        s = np.einsum("berp,berq->bpq", jt, jt) * (1.0 + damping[:, :1, None] * np.eye(self.q))
+        s = s - np.einsum("bekp,bekq->bpq", c, both[..., 1:])
+        h = np.einsum("berq,ber->bq", jt, r) - np.einsum("bekq,bek->bq", c, both[..., 0])
+        s = s + (1e-300 + 1e-12 * np.einsum("bqq->bq", s).max(-1))[:, None, None] * np.eye(self.q)
+        dt = np.linalg.solve(s, h[..., None])[..., 0]
+        return both[..., 0] - np.einsum("bekq,bq->bek", both[..., 1:], dt), dt
 
     def derivatives(self, x: Array, theta: Array, r: Array) -> tuple[Array, Array]:
         """Return the derivatives of the predictions: by positions (B, E, R, d) and by parameters (B, E, R, q)."""

@@ -310,7 +310,9 @@ def sign(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
 def speed(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
     """Return values that travelled at another speed than the file states."""
     factor = 1.0 + rng.choice([-1.0, 1.0]) * _log_uniform(rng, 3e-3, 0.2)
-    return replace(data, z=data.z * factor, sigma=data.sigma * factor), (), factor
+    # lengths do not depend on the stated speed
+    timed = str(rng.choice(["s", "ms"]))
+    return replace(data, z=data.z * factor, sigma=data.sigma * factor, unit=timed, own_sigma=False), (), factor
 
 
 def late(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:

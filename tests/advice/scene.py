@@ -15,7 +15,7 @@ LENGTHS = ("tdoa", "toa", "range", "range_sum")
 DIFFERENCES = ("tdoa", "groa")
 """Kinds with a second station that all rows share."""
 _METRES = {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048}
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 # WGS 84.
 _MAJOR, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
@@ -67,7 +67,7 @@ class Data:
 
     def size(self, unit: str) -> float:
         """Return a unit of length or time in metres; times are multiplied by the speed of the wave."""
-        return _METRES[unit] if unit in _METRES else _SECONDS[unit] * self.speed
+        return _METRES[unit] if unit in _METRES else SECONDS[unit] * self.speed
 
     def with_unit(self, rows: Array, meant: float, stated: float) -> Data:
         """Return the file whose rows state another unit than their values have; sizes of the units in SI."""
