@@ -7,6 +7,7 @@ stands, plus a price. The price is 9.2 for a cause (prior odds 100:1), 2 log of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -399,14 +400,14 @@ def same(draw: Draw, one: Scored, planted: Scored) -> bool:
 
 def _more(draw: Draw, one: Scored) -> bool:
     """Return whether an explanation has the planted one as a special case: more parameters for the same station."""
-    if draw.cause == "period" and one.stations == draw.stations:
+    if one.stations == draw.stations and draw.cause in ("offset", "period"):
         return one.cause in ("offset", "outlier", "moved", "drift")
     return one.cause == "outliers" and len(draw.stations) == 1 and draw.stations[0] in one.stations
 
 
-def verdict(draw: Draw) -> Verdict:
-    """Return the scores of a draw and the lead of its planted cause."""
-    found = scores(draw)
+def verdict(draw: Draw, found: Sequence[Scored] | None = None) -> Verdict:
+    """Return the scores of a draw and the lead of its planted cause; `found` are the scores, if they are known."""
+    found = scores(draw) if found is None else found
     if draw.cause is None:
         best = found[0]
         lead = min((one.score for one in found if one.cause != "none"), default=np.inf) - next(

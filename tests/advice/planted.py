@@ -332,7 +332,7 @@ def slant(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
 def wrong_height(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
     """Return a file that states a wrong height of the target as exact."""
     size = _size(rng)
-    return replace(data, level=float(scene.truth[0, 2]) + size * float(data.sigma[0])), (), size
+    return replace(data, level=float(scene.truth[0, 2] + size * data.sigma[0])), (), size
 
 
 def declination(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:

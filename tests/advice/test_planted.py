@@ -3,6 +3,7 @@
 import json
 import pickle
 from dataclasses import asdict
+from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
@@ -87,15 +88,13 @@ def clean_book():
 def judged(name, seed):
     """Return the scores of the judge of a draw, from the store of an earlier run of the same judge if it has them."""
     text = b"".join((_HERE / f"{part}.py").read_bytes() for part in ("planted", "scene", "judge"))
-    from hashlib import blake2b
-
     folder = KEPT / f"verdicts-{blake2b(text, digest_size=8).hexdigest()}"
     file = folder / f"{name.replace(' ', '_')}-{seed}.pickle"
     if file.exists():
-        return pickle.loads(file.read_bytes())
+        return verdict(drawn(name, seed), pickle.loads(file.read_bytes()))
     found = verdict(drawn(name, seed))
     folder.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(pickle.dumps(found))
+    file.write_bytes(pickle.dumps(found.scores))
     return found
 
 
