@@ -38,17 +38,26 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     cost, dof = float(plain.cost.sum()), int(case.dof.sum())
     if not np.isfinite(cost):
         # a position that the data determine badly, such as one in the plane of the stations, has a cost all the same
-        cost = float(equations_at(case.base, case.x).cost.sum()) if np.isfinite(case.x).all() else np.inf
-    if not np.isfinite(cost):
-        return ()
+        cost = min(_cost_at(case, case.x), _cost_at(case, plain.x[0]))
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
     case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
-    found = [*all_scores(case), _of_level(case, plain, cost, dof), *_of_late_rows(case)]
+    found = all_scores(case)
+    found += [_of_level(case, plain, cost, dof), *_of_late_rows(case)] if np.isfinite(cost) else []
+    if not found:
+        return ()
     found.sort(key=lambda one: one.score)
     if found[0].score > cost - GAP:
         return ()
     return tuple(_distinct(found))[:_LISTED]
+
+
+def _cost_at(case: MisfitCase, x: Array) -> float:
+    """Return the cost at unknowns (K, size); infinite without a value."""
+    if not np.isfinite(x).all():
+        return np.inf
+    cost = float(equations_at(case.base, x).cost.sum())
+    return cost if np.isfinite(cost) else np.inf
 
 
 def all_scores(case: MisfitCase) -> list[Scored]:

@@ -26,11 +26,12 @@ def verified(case: MisfitCase, found: Sequence[Scored]) -> tuple[Scored, ...]:
     """
     out = []
     for one in found:
-        cost = solved_cost(case, one)
-        # residuals of late rows have no chi-square
-        if not np.isfinite(one.cost):
+        # residuals of late rows have no chi-square, and larger noise suggests no other position
+        if not np.isfinite(one.cost) or one.change.cause == "noise":
             out.append(one)
-        elif cost <= one.cost + _SAME:
+            continue
+        cost = solved_cost(case, one)
+        if cost <= one.cost + _SAME:
             out.append(replace(one, cost=min(cost, one.cost), score=one.score + min(cost, one.cost) - one.cost))
     return tuple(sorted(out, key=lambda one: one.score))
 
