@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import optloc.station_health
     import optloc.tracking
     import optloc.uncertainty
+    from optloc.advice.advising import advise as advise
     from optloc.advice.diagnosis import diagnose as diagnose
     from optloc.base import units as units
     from optloc.base.errors import InvalidProblem as InvalidProblem, NoSolution as NoSolution

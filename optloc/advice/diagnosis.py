@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optloc.advice.advising import advise
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
 from optloc.bounds.rank import Observability, observability
-from optloc.model_checks.advice import advise
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.evidence import Reliability, reliability
-from optloc.model_checks.geometry import Advice
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

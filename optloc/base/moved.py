@@ -17,7 +17,7 @@ _NAMES = {
     "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce",
     "optloc.files": "Budget satellites",
     "optloc.model_checks": (
-        "Advice CommonLevel LateSignals Reliability advise determined distance_from_plane explained reliability"
+        "Advice CommonLevel LateSignals Reliability determined distance_from_plane explained reliability"
     ),
     "optloc.models": "Atmosphere Layers MODELS Model",
     "optloc.multi_target": "Emitters",

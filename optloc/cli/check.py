@@ -35,8 +35,8 @@ from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
 from optloc.linear.redundancy import degrees_of_freedom, present_unknowns
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.elements import By, batch_of
-from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.plausibility import CHECKS
 from optloc.models import MODELS

@@ -13,7 +13,7 @@ from optloc.bounds.rank import Observability, observability
 from optloc.cli.output import bar
 from optloc.files.propagation import NOT_STATED
 from optloc.files.reader import Loaded
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.partitions.epoch_fixes import (
     fix_columns,
     fix_epochs,

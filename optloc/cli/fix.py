@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from optloc.advice.advising import advise, advise_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim, replace_together
 from optloc.base.types import Array, Status
@@ -38,11 +39,11 @@ from optloc.files.constraint_table import ConstraintTable
 from optloc.files.reader import Loaded
 from optloc.files.table_import import ColumnHints
 from optloc.files.wave_speed import WaveOptions
-from optloc.model_checks.advice import advise, advise_at, explained_at
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.elements import GROUPINGS, By, batch_of
-from optloc.model_checks.geometry import Advice
 from optloc.model_checks.noise_level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.model_checks.plausibility import CHECKS
+from optloc.model_checks.single_error import explained_at
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.answer_texts import as_p, with_sigma

@@ -63,6 +63,7 @@ from optloc.problem.noise import Block, Noise, arrivals, group, group_members
 from optloc.problem.problem import Problem
 from optloc.problem.signal import Signal
 from optloc.problem.validation import checked
+from optloc.problem.written import Written
 from optloc.station_health.levels import NoiseLevels
 from optloc.station_health.structure import with_estimated_noise
 
@@ -158,7 +159,12 @@ class Draft:
     def plausible(self, surface: str) -> Loaded:
         """Return the problem with warnings on suspicious values; raise InvalidProblem for impossible values."""
         found = warnings_of(self.loaded.problem, self.chunks, self.numbers, surface, self.loaded.source)
-        return replace(self.loaded, warnings=found + unused_picks(self.chunks, self.loaded.problem.stations.names))
+        units = {chunk.kind: float(chunk.unit.factor) for chunk in self.chunks}
+        speed = self.chunks[0].units.speed if self.chunks else None
+        own = any(isinstance(one, str) for each in self.file.measurements for one in (each.sigma, each.arrival_sigma))
+        problem = replace(self.loaded.problem, written=Written(units, speed, own))
+        more = unused_picks(self.chunks, problem.stations.names)
+        return replace(self.loaded, problem=problem, warnings=found + more)
 
 
 def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:

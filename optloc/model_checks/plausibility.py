@@ -17,7 +17,7 @@ from optloc.base.cached import cached_property
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Band, Rows
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.models import MODELS
 from optloc.problem.chart import tail_probability
 from optloc.problem.noise import variances

@@ -6,7 +6,7 @@ batch axes. An array without batch axes is shared by all problems of the batch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,7 @@ from optloc.problem.forms import form_of
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 from optloc.problem.straight_phases import straight_s_rows
+from optloc.problem.written import Written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,6 +73,8 @@ class Problem(HasShortForm):
         Medium of the waves, for rows whose kinds follow bent rays; see `in_medium`.
     fences : tuple of Fence
         Uncertain half-planes, which are terms of the cost.
+    written : Written, optional
+        Units of the file; None for a problem without a file. They change no number.
     """
 
     stations: Stations
@@ -85,6 +88,7 @@ class Problem(HasShortForm):
     constraints: tuple[Constraint, ...] = ()
     medium: Medium | None = None
     fences: tuple[Fence, ...] = ()
+    written: Written | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Move fences from the constraints to `fences`: users state both in one list."""

@@ -35,7 +35,7 @@ from optloc.show.knowledge import has_place, known_rows
 from optloc.show.row_answer import row_answer, row_verdict, use_rows, why_rows
 
 if TYPE_CHECKING:
-    from optloc.model_checks.geometry import Advice
+    from optloc.model_checks.cause import Advice
 
 # Reasons that are printed for a batch: a screen shows them. The remaining ones are counted.
 _REASONS = 10
@@ -70,7 +70,7 @@ def answer_of(
     where, details : sequence of (str, str)
         Further rows of these sections.
     advice : sequence of Advice
-        Advice on the data, see `optloc.model_checks.advice.advise`.
+        Advice on the data, see `optloc.advise`.
     most : int
         Number of rows that tables show completely.
     """

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from optloc.base.types import ANSWERED, Status
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 
 SECTIONS = ("use", "where", "how sure", "why not", "details")
 """Names of the sections in the order in which every output prints them."""

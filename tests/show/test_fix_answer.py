@@ -3,7 +3,7 @@
 import pytest
 
 from optloc.base.types import Status
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.show.fix_answer import SECTIONS, AnswerSection, FixAnswer, FixSheet, advice_lines, verdict_of
 
 SHEET = FixSheet("Fixes", ("fix", "status"), [("a", "ok")])

@@ -11,7 +11,7 @@ from show.ranging import ranged
 
 from optloc.base.types import Status
 from optloc.cli.output import Screen, show_answer
-from optloc.model_checks.geometry import Advice
+from optloc.model_checks.cause import Advice
 from optloc.show import fix_page
 from optloc.show.describe_fix import answer_of
 from optloc.show.fix_answer import SECTIONS

@@ -20,7 +20,7 @@ from optloc.bounds.rank import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.linear.fences import margins, posterior_spread, unfenced
 from optloc.linear.least_squares_ranges import ranges
-from optloc.model_checks.advice import misfit_of
+from optloc.model_checks.single_error import misfit_of
 from optloc.model_checks.truncation import covariance_of
 from optloc.models import MODELS
 from optloc.models.layers import Layers

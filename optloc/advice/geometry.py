@@ -9,47 +9,29 @@ import numpy as np
 
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Band
+from optloc.kernels.sums import equations_at
 from optloc.linear.constraints import is_exact, violation
 from optloc.linear.redundancy import degrees_of_freedom
+from optloc.model_checks.cause import Advice
 from optloc.model_checks.score import descend, one_place
 from optloc.models import MODELS
+from optloc.problem.chart import tail_probability
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """A possible reason why a fix is not `ok`, and the remedy.
-
-    Parameters
-    ----------
-    cause : str
-        A keyword for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
-        "impossible", "constraint", "size", "slant", "height", "wrap", "offset", "scale", "rotation", "drift", "step" or
-        "burst".
-    seen : str
-        The observation, a sentence without its full stop.
-    advice : str
-        The remedy, a sentence without its full stop.
-    toml : str
-        Lines of a problem file for the remedy. Put them at the end of the file; put keys into `[[measurements]]`. Empty
-        if the remedy needs no lines.
-    """
-
-    cause: str
-    seen: str
-    advice: str
-    toml: str = ""
-
 
 # Limit of the chi-square that separates a position from its mirror image, if stations are not exactly in a plane. Below
 # the limit, the data separate no position from its image by three sigma.
 _SEPARATED = 9.0
 # Share of the extent of the stations that counts as zero with any noise: a micrometre per metre.
 _FLAT = 1e-6
+# Chi-square probability below which the data refute a fix, as for the status `misfit`.
+_REFUTED = 1e-4
 # Share of the extent of the stations that is rounding of their coordinates.
 _ROUNDING = 1e-12
+# Height of stations above the ellipsoid, m, below which they may be in the sea: without a map of the
+# ground, a target below them is possible.
+_DRY = 0.5
 # Cosine above which a normal counts as an axis of the frame, so that a box can exclude one side of the plane.
 _ALONG = 0.999
 
@@ -151,6 +133,9 @@ def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
         return
     # whether the stations have no extent along each principal axis, in ascending order of the extent
     d, flat = problem.dimension, np.array([_is_flat(problem, shape, i) for i in range(problem.dimension)])
+    # noise as large as the whole array says nothing about the shape of the array
+    if flat[-1] or _one_side(problem, shape):
+        return
     if flat[0] and not (d == 3 and flat[1]) and _equality_excludes_image(problem, shape):
         return
     if d == 3 and flat[1]:
@@ -169,6 +154,24 @@ def _mirror_advice(problem: Problem, x: Array) -> Iterator[Advice]:
         seen = f"the mirror image of the fix in the best-fitting {name} of the stations ({_describe_offset(shape)})"
         seen += " fits almost equally well"
         yield Advice("mirror", seen, _side_advice(problem, shape)[0], _side_advice(problem, shape)[1])
+
+
+# Heights above the plane of the stations at which both sides are tested, in extents of the stations.
+_HEIGHTS = (0.01, 0.1, 0.3, 1.0, 3.0)
+
+
+def _one_side(problem: Problem, shape: _Shape) -> bool:
+    """Return whether the constraints exclude one side of the plane of the stations."""
+    if not problem.constraints or not problem.layout.shares("position") or problem.epochs != 1:
+        return False
+    slot, _ = problem.layout.find("position")
+    steps = shape.extent[-1] * np.array(_HEIGHTS)[:, None] * shape.axes[:, 0]
+    inside = []
+    for sign in (1.0, -1.0):
+        x = np.zeros((len(steps), problem.layout.size))
+        x[:, slot.start : slot.start + problem.dimension] = shape.centre + sign * steps
+        inside.append(bool((violation(problem.take(np.zeros(len(steps), dtype=int)), x) <= 0.0).any()))
+    return inside[0] != inside[1]
 
 
 # Share of the normal in the gradient of an equality above which a mirror image violates the equality.
@@ -219,7 +222,7 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     The cost of the second minimum exceeds the cost of the fix by less than nine. The minimum must be on the other side
     of the plane and satisfy the constraints.
     """
-    if not one_place(problem) or not np.isfinite(x).all():
+    if not one_place(problem) or not np.isfinite(x).all() or not _fits(problem, x):
         return False
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -235,12 +238,21 @@ def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
     )
 
 
+def _fits(problem: Problem, x: Array) -> bool:
+    """Return whether the data accept a fix; the image of a refuted fix says nothing about the geometry."""
+    cost, dof = equations_at(problem, x).cost, degrees_of_freedom(problem)
+    return bool(dof[0] < 1 or tail_probability(np.atleast_1d(cost), np.atleast_1d(dof))[0] >= _REFUTED)
+
+
 def _side_advice(problem: Problem, shape: _Shape) -> tuple[str, str]:
     """Return advice on how to decide between the sides of the plane, and the lines of a problem file for it."""
     if problem.constraints:
         return "check if a constraint excludes one of the two, or add a station off it, a bearing or a height", ""
     normal = shape.axes[:, 0]
     if problem.frame.geodetic:
+        # a target below stations at sea level is in the water
+        if float(np.min(problem.frame.to_geodetic(shape.places)[2])) < _DRY:
+            return "state the height or the depth of the target; or add a station off it, a bearing or a height", ""
         advice = "if the target is above ground, use `--above-ground`; or add a station off it"
         return f"{advice}, a bearing or a height", '[[constraints]]\nkind = "above-ground"\n'
     axis = int(np.argmax(np.abs(normal)))

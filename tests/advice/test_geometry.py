@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from model_checks.small import PLACE, ranges_to
 
-from optloc.model_checks.geometry import advise_on_geometry
+from optloc.advice.geometry import advise_on_geometry
 
 LINE = np.array([[0.0, 0.0], [500.0, 0.0], [1000.0, 0.0], [1500.0, 0.0]])
 FLOOR = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0], [0.0, 1e3, 0.0], [1e3, 1e3, 0.0], [500.0, 300.0, 0.0]])

@@ -1,97 +1,26 @@
-"""Explanations of a fix that is not `ok`: geometry, misread values (unit, sign, convention), and systematic errors.
+"""The single systematic error that explains most of the misfit of a run, by score tests.
 
-Score tests name a systematic error. Each explanation comes with a remedy, if possible as lines of a problem file. A
-parameter vector has `size` numbers: first the unknowns that all epochs share, then the local unknowns of each epoch.
+A parameter vector has `size` numbers: first the unknowns that all epochs share, then the local unknowns of each epoch.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
-from optloc.model_checks.geometry import Advice, advise_on_geometry
-from optloc.model_checks.plausibility import CHECKS, suspicious_values
-from optloc.model_checks.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
-from optloc.model_checks.unit_mistakes import advise_on_values
-from optloc.models import MODELS
+from optloc.model_checks.score import Candidate, Explained, explain_misfit
 from optloc.problem.bias import family
 from optloc.problem.epochs import by_epoch, has_correlated_epochs, separable, some_epochs
 from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 
-# Causes of advice on values that propose no other reading of the values, so that a systematic error may explain them.
-_NO_READING = ("impossible", "constraint", *(check.name for check in CHECKS))
-# Largest number of explanations of a misfit that are listed if several fit equally well.
-_MAX_ERRORS = 3
 # Largest number of rows of a run that are tested: lasting errors are visible in them, and tests of all channels of more
 # rows take seconds.
 _MAX_ROWS = 2000
-# Probability of the chi-square test below which the residuals are a misfit.
-_MISFIT = 0.01
-
-
-def advise(problem: Problem, fix: Fix | None = None) -> Any:
-    """Return possible reasons why a fix is not `ok`, each with the lines of a problem file or the option that helps.
-
-    The reasons are: stations in a plane or on a line; no redundancy; values with another unit, sign or convention; and
-    a systematic error that explains the misfit. This error is an offset, scale, turn, drift or step of one channel or
-    of a whole kind.
-
-    Parameters
-    ----------
-    problem : Problem
-        One problem, a run, or a batch (...) of problems.
-    fix : Fix, optional
-        The fix of the problem, (k,) fixes of a run whose epochs share nothing, or the fixes of the batch. Without it,
-        the check uses the geometry, and compares values with a new fit.
-
-    Returns
-    -------
-    tuple of Advice, or object array (...) of tuples
-        Empty if nothing was found. With a correct model, a score test reports an error in one of a thousand cases.
-
-    Raises
-    ------
-    InvalidProblem
-        If the fix is not a fix of this problem.
-    """
-    shape = problem.batch_shape
-    if not shape:
-        return advise_at(problem, np.full((1, problem.layout.size), np.nan) if fix is None else fix.x)
-    flat, out = problem.flat(), np.empty(int(np.prod(shape)), dtype=object)
-    if fix is not None and fix.shape != shape:
-        raise InvalidProblem(
-            f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give one fix per problem"
-        )
-    x = np.full((len(out), problem.layout.size), np.nan) if fix is None else fix.flat().x
-    for i in range(len(out)):
-        out[i] = advise_at(flat.take(np.array([i])), x[i])
-    return out.reshape(shape)
-
-
-def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
-    """Return the advice for one problem or run at a fix (size,), or at fixes (k, size of an epoch) of separate epochs.
-
-    Least squares starts at `x`. `x` is NaN if there is no fix; then only a problem with one position is fitted here.
-    """
-    flat, x = problem.flat(), _joined(problem, np.asarray(x))
-    # planned rows without a measurement also count for the geometry
-    found = list(advise_on_geometry(flat, x))
-    problem, x = _shortened(*_without_unknown(flat, x))
-    if not bool((problem.weight > 0.0).any()):
-        return tuple(found)
-    values = [*suspicious_values(problem), *advise_on_values(problem, x)]
-    if not np.isfinite(x).all() and one_place(problem):
-        x = fit_anywhere(problem).x
-    # if another unit, sign or convention explains the values, no systematic error is needed
-    read = any(one.cause not in _NO_READING for one in values)
-    errors = [] if read else [_error_advice(problem, one) for one in explain_misfit(problem, x)[:_MAX_ERRORS]]
-    return (*values, *errors, *found)
 
 
 def explained(problem: Problem, fix: Fix) -> Problem | None:
@@ -130,7 +59,7 @@ def explained_at(problem: Problem, x: Array) -> Problem | None:
     """Return the result of `explained` at `x`: a fix (size,), or fixes (k, size of an epoch) of separate epochs."""
     if problem.batch_shape:
         raise InvalidProblem("a batch of problems was given", "explained", "call it for each problem")
-    part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
+    part, x = _shortened(*without_unknown(problem.flat(), joined_vector(problem, np.asarray(x))))
     explanations = explain_misfit(part, x)
     if not explanations:
         return None
@@ -142,7 +71,7 @@ def misfit_of(problem: Problem, x: Array) -> str:
 
     `problem` is a flat batch of one run. If no error of one station explains the misfit, the sentence states this.
     """
-    part, x = _shortened(*_without_unknown(problem, x[None]))
+    part, x = _shortened(*without_unknown(problem, x[None]))
     explanations = explain_misfit(part, x)
     if not explanations:
         return "no error of a single station explains the misfit"
@@ -166,7 +95,7 @@ def _bias_of_run(problem: Problem, candidate: Candidate) -> Bias:
     return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 
-def _joined(problem: Problem, x: Array) -> Array:
+def joined_vector(problem: Problem, x: Array) -> Array:
     """Return the parameter vector (1, size) of a problem at `x`.
 
     `x` is (size,) or (1, size). If the epochs of the problem share nothing, `x` may also hold k separate fixes
@@ -201,7 +130,7 @@ def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
     return some_epochs(problem, chosen), np.concatenate([x[:, :n], local.reshape(len(x), -1)], axis=1)
 
 
-def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
+def without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
     """Return the problem without values that are not finite and without epochs that have no fix, and a finite vector.
 
     These rows stay in the arrays with weight zero. In the vector (1, size), an epoch without a fix gets the mean of the
@@ -229,33 +158,6 @@ def _noun(candidate: Candidate) -> str:
     return {"step": "a step", "burst": "a burst of errors"}.get(candidate.form) or form_of(candidate.bias).noun
 
 
-def _error_advice(problem: Problem, explanation: Explained) -> Advice:
-    """Return the advice about a systematic error: its form, channel, size, duration and p-values."""
-    bias, candidate = explanation.candidate.bias, explanation.candidate
-    value, unit = _size(problem, explanation)
-    station = bias.members[0]
-    subject = f"station {station}" if candidate.per == "station" else f"all {station} rows"
-    rows = (
-        f" in its {candidate.kind} rows"
-        if candidate.per == "station" and candidate.kind and len(problem.rows) > 1
-        else ""
-    )
-    kind, what = candidate.form, _noun(candidate)
-    when = f" from t = {candidate.since:.6g} s " if np.isfinite(candidate.since) else ""
-    when += {"step": "on", "burst": f"to {candidate.until:.6g} s"}.get(kind, "")
-    better = "the misfit" if explanation.p_before < _MISFIT else "the residuals better"
-    seen = f"{what} of {subject}{rows} of {value} {unit}{when} would explain {better}: p = {explanation.p_after:.2g}"
-    seen += f" with it, {explanation.p_before:.2g} without"
-    if kind == "step":
-        return Advice("step", seen, "split the run there, or give the later rows another station name")
-    if kind == "burst":
-        return Advice("burst", seen, "remove these rows, or use the method 'robust'")
-    # a factor of all lengths of a kind is a wrong unit or a wrong wave speed
-    lengths = candidate.per == "kind" and kind == "scale" and MODELS[str(candidate.kind)].quantity == "length"
-    where = "the wave speed and the unit" if lengths else "this channel"
-    return Advice(kind, seen, f"check {where}; until then, model the error", _lines(problem, explanation))
-
-
 def _size(problem: Problem, explanation: Explained) -> tuple[str, str]:
     """Return the estimate of an error with its standard deviation as text, and its unit.
 
@@ -273,19 +175,3 @@ def _unit(problem: Problem, explanation: Explained) -> str:
     """Return the SI unit of a systematic error."""
     larger = replace(problem, biases=(*problem.biases, explanation.candidate.bias))
     return larger.layout.find(explanation.candidate.bias.name)[0].unit
-
-
-def _lines(problem: Problem, explanation: Explained) -> str:
-    """Return the lines of a problem file that model an error as a bias."""
-    candidate, bias = explanation.candidate, explanation.candidate.bias
-    used_names = {each.name for each in problem.biases}
-    name = next(text for text in (bias.form, *(f"{bias.form} {i}" for i in range(2, 99))) if text not in used_names)
-    lines = [f'name = "{name}"', f'form = "{bias.form}"', f'per = "{candidate.per}"']
-    lines += [f'kind = "{candidate.kind}"'] if candidate.kind else []
-    lines += [f"members = [{_quoted(bias.members[0])}]"] if candidate.per == "station" else []
-    return "\n".join(["[[biases]]", *lines]) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """Return a name as a TOML string."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,208 @@
+"""The causes of a misfit: all explanations in one comparison, and the advice on the best of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from optloc.advice.change import Change, MisfitCase, Wording
+from optloc.advice.explanation_table import EXPLANATIONS, LATE_PRICE
+from optloc.advice.fits import Fits, fit
+from optloc.advice.rows_and_noise import late_fit, late_words
+from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
+from optloc.advice.suspects import Suspects
+from optloc.advice.wording import no_words
+from optloc.base.types import Array
+from optloc.kernels.sums import equations_at
+from optloc.model_checks.cause import Advice
+
+# Smallest price of any explanation: a misfit of a smaller cost has no cause.
+_CHEAPEST = 2.0
+# Largest number of causes that are listed if the data do not decide.
+_LISTED = 3
+# Number of epochs in which other readings are compared first, and the number of readings that are compared in all.
+_FIRST_EPOCHS, _KEPT = 2, 8
+# Relative difference of the costs of equal explanations: rounding, and the end of the descents.
+_EQUAL = 1e-3
+
+
+def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
+    """Return the explanations that the data do not exclude, the best first; empty if none is needed.
+
+    The first is alone if all others score worse by the gap.
+    """
+    plain = fit(case, [Change("none", no_words)])
+    cost, dof = float(plain.cost.sum()), int(case.dof.sum())
+    if not np.isfinite(cost):
+        # a position that the data determine badly, such as one in the plane of the stations, has a cost all the same
+        cost = min(_cost_at(case, case.x), _cost_at(case, plain.x[0]))
+    if cost < GAP + _CHEAPEST or dof < 1:
+        return ()
+    case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
+    found = all_scores(case)
+    found += [_of_level(case, plain, cost, dof), *_of_late_rows(case)] if np.isfinite(cost) else []
+    if not found:
+        return ()
+    found.sort(key=lambda one: one.score)
+    if found[0].score > cost - GAP:
+        return ()
+    return tuple(_distinct(found))[:_LISTED]
+
+
+def _cost_at(case: MisfitCase, x: Array) -> float:
+    """Return the cost at unknowns (K, size); infinite without a value."""
+    if not np.isfinite(x).all():
+        return np.inf
+    cost = float(equations_at(case.base, x).cost.sum())
+    return cost if np.isfinite(cost) else np.inf
+
+
+def all_scores(case: MisfitCase) -> list[Scored]:
+    """Return the scores of all changes of all explanations."""
+    suspects, changes, odds = Suspects(case), [], []
+    for entry in list(EXPLANATIONS.values()):
+        for change in entry.changes(case, suspects):
+            changes.append(change)
+            odds.append(entry.price)
+    out = []
+    fitted = {id(change) for change in suspects.offsets}
+    own = [i for i, change in enumerate(changes) if change.base is None and id(change) not in fitted]
+    own = _promising(case, changes, own)
+    if suspects.offsets:
+        price = EXPLANATIONS["offset"].price
+        out += scored(case, list(suspects.offsets), suspects.fits, [price] * len(suspects.offsets))
+    if own:
+        some = [changes[i] for i in own]
+        out += scored(case, some, fit(case, some), [odds[i] for i in own])
+    for i, change in enumerate(changes):
+        if change.base is not None:
+            other = _in_base(case, change)
+            out += scored(other, [change], fit(other, [change]), [odds[i]])
+    return out
+
+
+def _in_base(case: MisfitCase, change: Change) -> MisfitCase:
+    """Return the case in the structure that a change states."""
+    assert change.base is not None
+    x = np.zeros((len(case.times), change.base.layout.size))
+    new, old = change.base.layout, case.base.layout
+    for slot in old.shared:
+        there, _ = new.find(slot.name)
+        size = min(slot.size, there.size)
+        x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
+    x[:, new.n_shared :] = case.x[:, old.n_shared :]
+    return replace(case, base=change.base, x=x)
+
+
+def _promising(case: MisfitCase, changes: Sequence[Change], numbers: list[int]) -> list[int]:
+    """Return the numbers of the changes without the readings that a few epochs exclude."""
+    readings = [i for i in numbers if not changes[i].station and not changes[i].columns and not changes[i].members]
+    if len(case.times) <= _FIRST_EPOCHS or len(readings) <= _KEPT:
+        return numbers
+    first = np.argsort(-case.dof, kind="stable")[:_FIRST_EPOCHS]
+    few = MisfitCase(
+        case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin
+    )
+    some = [changes[i].in_epochs(first) for i in readings]
+    of_first = {id(one.change): one.score for one in scored(few, some, fit(few, some), [0.0] * len(some))}
+    score = {i: of_first.get(id(change), np.inf) for i, change in zip(readings, some, strict=True)}
+    kept = sorted(readings, key=lambda i: score[i])[:_KEPT]
+    return [i for i in numbers if i not in set(readings) - set(kept)]
+
+
+def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:
+    """Return the explanation that all noise is understated."""
+    level = float(np.sqrt(cost / dof))
+    # a weight changes the variances of rows, and not their covariances
+    simple = len(case.kinds) == 1 and all(block.row.shape[1] == 1 for block in case.base.noise.blocks)
+
+    def words(theta: Array, sigma: Array) -> Wording:
+        seen = f"noise that is {level:.3g} times as large as stated would explain the misfit"
+        lines = f"weight = {level**-2:.6g}\n" if simple else ""
+        return Wording(seen, "state a larger noise, or use `--rescale-noise` for several epochs", lines)
+
+    none = np.zeros(0)
+    change = Change("noise", words, spread=level, levels=True)
+    return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0])
+
+
+def _of_late_rows(case: MisfitCase) -> Iterator[Scored]:
+    """Yield the explanation that some rows are late."""
+    found = late_fit(case)
+    if found is not None:
+        change, theta = Change("late", partial(late_words, found)), np.array([found.share, found.delay])
+        dof = int(case.dof.sum()) - 2
+        price = LATE_PRICE + price_of_parameters(np.zeros(2), np.ones(2))
+        # residuals of late rows have no chi-square
+        yield Scored(change, theta, np.zeros(2), np.nan, dof, found.score + price, found.x)
+
+
+def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:
+    """Yield the explanations within the gap of the best; of equal ones, only the simplest.
+
+    `found` is in ascending order of the score.
+    """
+    names = list(EXPLANATIONS)
+    kept: list[Scored] = []
+    for one in found:
+        if one.score > found[0].score + GAP:
+            break
+        if any(_is_part(other, one) for other in kept):
+            continue
+        equal = next((i for i, other in enumerate(kept) if _is_equal(one, other)), None)
+        if equal is None:
+            kept.append(one)
+        elif _rank(one, names) < _rank(kept[equal], names):
+            kept[equal] = replace(one, score=kept[equal].score)
+    yield from kept
+
+
+def _rank(one: Scored, names: list[str]) -> int:
+    """Return the place of a cause in the table: the simplest cause of a station comes first."""
+    return names.index(one.change.cause) if one.change.cause in names else len(names)
+
+
+def _is_part(one: Scored, other: Scored) -> bool:
+    """Return whether a pair of outliers contains an explanation with a better score: the second row is not needed."""
+    return (
+        other.change.cause == "outliers"
+        and bool(one.change.station)
+        and (set(one.change.station) <= set(other.change.station) and one.change.cause != "outliers")
+    )
+
+
+def _is_equal(one: Scored, other: Scored) -> bool:
+    """Return whether two explanations are the same statement about the same stations."""
+    if (one.change.cause, one.change.station, one.change.kind) == (
+        other.change.cause,
+        other.change.station,
+        other.change.kind,
+    ):
+        return not (one.change.members and one.change.members != other.change.members) or one.change.cause == "noise"
+    same = set(one.change.station) == set(other.change.station) and one.change.station
+    return bool(same and one.dof == other.dof and abs(one.cost - other.cost) < _EQUAL * (1.0 + one.cost))
+
+
+def advice_on(found: Sequence[Scored]) -> Iterator[Advice]:
+    """Yield the advice on explanations in ascending order of their scores."""
+    for i, one in enumerate(found):
+        words = one.change.words(one.theta, one.sigma)
+        rivals = [other.score for j, other in enumerate(found) if j != i]
+        gap = min(rivals) - one.score if rivals else GAP
+        p = f" (p = {one.p:.2g} with it)" if np.isfinite(one.p) and one.change.cause != "noise" else ""
+        yield Advice(
+            one.change.cause,
+            words.seen + p,
+            words.advice,
+            words.toml,
+            words.option,
+            one.change.station,
+            one.change.members,
+            tuple(one.theta.tolist()),
+            one.cost,
+            gap,
+            one.p,
+        )

@@ -1,0 +1,25 @@
+"""How a file states the values of a problem: units and wave speed, for messages that name a line of the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """Units of the values in a file. A problem in memory is in SI units.
+
+    Parameters
+    ----------
+    units : mapping of str to float
+        Size of one unit of the values by kind, in SI units; negative if the sign of the values is turned.
+    speed : float, optional
+        Speed, m/s, by which times are multiplied.
+    noise_has_unit : bool
+        Whether the noise is text with a separate unit, so that it stays if the unit of the values changes.
+    """
+
+    units: Mapping[str, float] = field(default_factory=dict)
+    speed: float | None = None
+    noise_has_unit: bool = False
