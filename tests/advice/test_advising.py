@@ -82,7 +82,11 @@ PLANTED = {
     "nanoseconds": (document("tdoa", lambda z: z / 0.299792458), "unit", "in ns instead of the stated m"),
     "kilometres": (document("range", lambda z: z * 1e-3), "unit", "in km instead of the stated m"),
     "seconds": (document("tdoa", lambda z: z / 299792458.0), "unit", "in s instead of the stated m"),
-    "wrong prefix": (document("range", lambda z: z / 0.299792458e3, keys='unit = "m"\n'), "unit", "in us instead of the stated m"),
+    "wrong prefix": (
+        document("range", lambda z: z / 0.299792458e3, keys='unit = "m"\n'),
+        "unit",
+        "in us instead of the stated m",
+    ),
     "drift of a clock": (
         document("tdoa", lambda z: z + np.arange(len(z))[:, None] * at(1, 30.0), epochs=9),
         "drift",

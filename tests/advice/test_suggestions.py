@@ -60,5 +60,5 @@ def test_pasted_suggestions_have_the_promised_cost_in_full(tmp_path):
 
 def test_a_pasted_key_replaces_the_key_of_each_table():
     file = 'format = 2\n[[measurements]]\nkind = "range"\nunit = "m"\nrows = []\n'
-    assert pasted(file, 'unit = "ns"\n') == file.replace("kind", 'unit = "ns"\nkind').replace('unit = "m"\n', "")
+    assert pasted(file, 'unit = "ns"\n') == file.replace('unit = "m"\n', "").replace("kind", 'unit = "ns"\nkind')
     assert pasted(file, '[[biases]]\nname = "offset"\n').endswith('rows = []\n\n[[biases]]\nname = "offset"\n')
