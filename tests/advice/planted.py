@@ -284,9 +284,11 @@ def unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
 
 
 def coordinate_unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
-    factor = float(rng.choice([1e3, 1e-3, 100.0, 1e-2, 1.0 / 0.3048]))
-    # a stated noise has its own unit, otherwise a change of the values explains the data as well
-    return replace(data, place=data.place * factor, own_sigma=True), (), factor
+    stated, meant = rng.choice([("m", "km"), ("m", "mm"), ("m", "cm"), ("m", "ft"), ("km", "m"), ("cm", "m")])
+    factor = data.size(stated) / data.size(meant)
+    # a noise without a unit of its own would scale with the values, which then explain the data as well
+    planted = replace(data, place=data.place * factor, own_sigma=True, place_unit=str(stated))
+    return planted, (), factor
 
 
 def compass(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
