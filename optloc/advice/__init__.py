@@ -7,7 +7,7 @@ from optloc.base.faces import exported
 if TYPE_CHECKING:
     from optloc.advice.advising import advise as advise
     from optloc.advice.diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
-    from optloc.advice.explanations import EXPLANATIONS as EXPLANATIONS, Explanation as Explanation
+    from optloc.advice.explanation_table import EXPLANATIONS as EXPLANATIONS, PossibleCause as PossibleCause
     from optloc.model_checks.cause import Advice as Advice
     from optloc.model_checks.single_error import explained as explained
 

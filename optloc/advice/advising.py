@@ -17,6 +17,7 @@ from optloc.base.types import Array
 from optloc.model_checks.cause import Advice
 from optloc.model_checks.plausibility import suspicious_values
 from optloc.model_checks.single_error import joined_vector, without_unknown
+from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -68,7 +69,9 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     flat, x = problem.flat(), joined_vector(problem, np.asarray(x))
     # planned rows without a measurement also count for the geometry
     geometry = tuple(advise_on_geometry(flat, x))
-    part, x = without_unknown(flat, x)
+    # separate epochs without a fix are searched; the unknowns of a run need a value to start from
+    known = np.where(np.isfinite(flat.z), flat.z, 0.0), np.where(np.isfinite(flat.z), flat.weight, 0.0)
+    part, x = (flat.with_rows(*known), x) if separable(flat) else without_unknown(flat, x)
     if not bool((part.weight > 0.0).any()):
         return geometry
     # a layered medium or a wind changes nothing that an explanation would change: rows keep their rays
@@ -77,17 +80,13 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
 
 def _on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     """Yield the advice on the values of a flat batch of one problem at `x` (1, size)."""
-    doubtful = suspicious_values(problem)
-    yield from doubtful
     case = case_of(problem, x)
-    found = () if case is None else causes_of(case)
-    if case is not None:
-        found = verified(case, found)
+    found = () if case is None else verified(case, causes_of(case))
     if not found and case is not None and problem.constraints:
         yield from constraint_advice(case)
-    impossible = tuple(impossible_advice(problem))
     # a cause that explains the data explains impossible values, too; larger noise does not
     if not found or found[0].change.cause == "noise":
+        impossible = (*suspicious_values(problem), *impossible_advice(problem))
         yield from impossible
         found = () if impossible else found
     yield from advice_on(found)

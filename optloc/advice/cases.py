@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.advice.change import Case
+from optloc.advice.change import MisfitCase
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
 from optloc.linear.equalities import spare_rows
@@ -18,7 +18,7 @@ _EPOCHS, _WORST = 12, 3
 _ROWS = 400
 
 
-def case_of(problem: Problem, x: Array) -> Case | None:
+def case_of(problem: Problem, x: Array) -> MisfitCase | None:
     """Return the case of a problem; None if no epoch has redundancy.
 
     Parameters
@@ -35,7 +35,7 @@ def case_of(problem: Problem, x: Array) -> Case | None:
         if dof[0] < 1:
             return None
         number = np.flatnonzero(np.isin(problem.epoch, _kept_epochs(problem, part)))[None]
-        return Case(part, np.zeros(1), number, start, dof, origin)
+        return MisfitCase(part, np.zeros(1), number, start, dof, origin)
     base = by_epoch(problem).flat()
     number = np.full((problem.epochs, base.count), -1)
     number[problem.epoch, rows_by_epoch(problem)] = np.arange(problem.count)
@@ -43,7 +43,7 @@ def case_of(problem: Problem, x: Array) -> Case | None:
     chosen = _sample(base, starts, dof)
     if not len(chosen):
         return None
-    return Case(base.take(chosen), problem.times[chosen], number[chosen], starts[chosen], dof[chosen], origin)
+    return MisfitCase(base.take(chosen), problem.times[chosen], number[chosen], starts[chosen], dof[chosen], origin)
 
 
 def _by_epoch(problem: Problem, base: Problem, x: Array) -> Array:
@@ -64,7 +64,7 @@ def _sample(base: Problem, x: Array, dof: Array) -> Array:
     if len(able) <= _EPOCHS:
         return able
     cost = equations_at(base, np.nan_to_num(x)).cost - dof
-    worst = able[np.argsort(-np.where(np.isfinite(cost[able]), cost[able], -np.inf), kind="stable")[:_WORST]]
+    worst = able[np.argsort(-np.where(np.isfinite(cost[able]), cost[able], np.inf), kind="stable")[:_WORST]]
     even = able[np.linspace(0, len(able) - 1, _EPOCHS - _WORST).round().astype(int)]
     return np.unique(np.concatenate([worst, even]))
 

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Wording
-from optloc.advice.explanations import EXPLANATIONS, LATE_PRICE
+from optloc.advice.change import Change, MisfitCase, Wording
+from optloc.advice.explanation_table import EXPLANATIONS, LATE_PRICE
 from optloc.advice.fits import Fits, fit
 from optloc.advice.rows_and_noise import late_fit, late_words
 from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
@@ -28,7 +28,7 @@ _FIRST_EPOCHS, _KEPT = 2, 8
 _EQUAL = 1e-3
 
 
-def causes_of(case: Case) -> tuple[Scored, ...]:
+def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     """Return the explanations that the data do not exclude, the best first; empty if none is needed.
 
     The first is alone if all others score worse by the gap.
@@ -45,7 +45,7 @@ def causes_of(case: Case) -> tuple[Scored, ...]:
     return tuple(_distinct(found))[:_LISTED]
 
 
-def all_scores(case: Case) -> list[Scored]:
+def all_scores(case: MisfitCase) -> list[Scored]:
     """Return the scores of all changes of all explanations."""
     suspects, changes, odds = Suspects(case), [], []
     for entry in list(EXPLANATIONS.values()):
@@ -69,7 +69,7 @@ def all_scores(case: Case) -> list[Scored]:
     return out
 
 
-def _in_base(case: Case, change: Change) -> Case:
+def _in_base(case: MisfitCase, change: Change) -> MisfitCase:
     """Return the case in the structure of a change that has its own."""
     assert change.base is not None
     x = np.zeros((len(case.times), change.base.layout.size))
@@ -82,22 +82,23 @@ def _in_base(case: Case, change: Change) -> Case:
     return replace(case, base=change.base, x=x)
 
 
-def _promising(case: Case, changes: Sequence[Change], numbers: list[int]) -> list[int]:
+def _promising(case: MisfitCase, changes: Sequence[Change], numbers: list[int]) -> list[int]:
     """Return the numbers of the changes without the readings that a few epochs exclude."""
     readings = [i for i in numbers if not changes[i].station and not changes[i].columns and not changes[i].members]
     if len(case.times) <= _FIRST_EPOCHS or len(readings) <= _KEPT:
         return numbers
     first = np.argsort(-case.dof, kind="stable")[:_FIRST_EPOCHS]
-    few = Case(
+    few = MisfitCase(
         case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin
     )
-    some = [changes[i] for i in readings]
+    some = [changes[i].in_epochs(first) for i in readings]
     of_first = {id(one.change): one.score for one in scored(few, some, fit(few, some), [0.0] * len(some))}
-    kept = sorted(readings, key=lambda i: of_first.get(id(changes[i]), np.inf))[:_KEPT]
+    score = {i: of_first.get(id(change), np.inf) for i, change in zip(readings, some, strict=True)}
+    kept = sorted(readings, key=lambda i: score[i])[:_KEPT]
     return [i for i in numbers if i not in set(readings) - set(kept)]
 
 
-def _of_level(case: Case, plain: Fits, cost: float, dof: int) -> Scored:
+def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:
     """Return the explanation that all noise is understated."""
     level = float(np.sqrt(cost / dof))
 
@@ -111,7 +112,7 @@ def _of_level(case: Case, plain: Fits, cost: float, dof: int) -> Scored:
     return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0])
 
 
-def _of_late_rows(case: Case) -> Iterator[Scored]:
+def _of_late_rows(case: MisfitCase) -> Iterator[Scored]:
     """Yield the explanation that some rows are late."""
     found = late_fit(case)
     if found is not None:

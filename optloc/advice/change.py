@@ -7,7 +7,7 @@ coordinates, q parameters of a change.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -21,7 +21,7 @@ from optloc.problem.problem import Problem
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class ErrorColumn:
     """One unknown parameter of a change, and its effect on the rows.
 
     Parameters
@@ -68,7 +68,7 @@ class Change:
         Factors and shift of the values, and factors of the standard deviations and of the weights.
     position : array (1, s, d), optional
         Positions of the stations instead of the stated ones.
-    columns : tuple of Column
+    columns : tuple of ErrorColumn
         Unknown parameters.
     moved : int
         Number of a station whose position has an unknown error, d more parameters; -1 for none.
@@ -97,7 +97,7 @@ class Change:
     spread: Array | float = 1.0
     weight: Array | float = 1.0
     position: Array | None = None
-    columns: tuple[Column, ...] = ()
+    columns: tuple[ErrorColumn, ...] = ()
     moved: int = -1
     starts: tuple[tuple[float, ...], ...] = ()
     x: Array | None = None
@@ -107,13 +107,18 @@ class Change:
     kind: str = ""
     base: Problem | None = None
 
+    def in_epochs(self, items: Array) -> Change:
+        """Return a change without parameters in some of the epochs."""
+        arrays = {name: getattr(self, name) for name in ("factor", "shift", "spread", "weight")}
+        return replace(self, **{name: each[items] for name, each in arrays.items() if np.ndim(each) == 2})
+
     def size(self, dimension: int) -> int:
         """Return the number q of parameters."""
         return len(self.columns) + (dimension if self.moved >= 0 else 0)
 
 
 @dataclass(frozen=True)  # without slots, because the cached properties need `__dict__`
-class Case:
+class MisfitCase:
     """A problem whose misfit must be explained, as a flat batch of K separate epochs.
 
     Parameters

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.advice.change import Case, Change
+from optloc.advice.change import Change, MisfitCase
 from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
@@ -57,7 +57,7 @@ class Fits:
         return Fits(self.x[items], self.theta[items], self.sigma[items], self.cost[items])
 
 
-def changed(case: Case, changes: Sequence[Change], theta: Array) -> Problem:
+def changed(case: MisfitCase, changes: Sequence[Change], theta: Array) -> Problem:
     """Return the problems (L,) after the changes, with their parameters at `theta` (E, q).
 
     An error that scales the prediction h enters as values and noise divided by the scale: the whitened residual is the
@@ -96,7 +96,7 @@ def _rescaled(noise: Noise, size: Array) -> Noise:
     return Noise(tuple(blocks))
 
 
-def _relocated(case: Case, lanes: Problem, changes: Sequence[Change], theta: Array) -> Problem:
+def _relocated(case: MisfitCase, lanes: Problem, changes: Sequence[Change], theta: Array) -> Problem:
     """Return the lanes with the positions of the stations that the changes state or estimate."""
     if not any(change.position is not None or change.moved >= 0 for change in changes):
         return lanes
@@ -112,14 +112,14 @@ def _relocated(case: Case, lanes: Problem, changes: Sequence[Change], theta: Arr
     return replace(lanes, stations=replace(lanes.stations, position=all_places.reshape(-1, *core)))
 
 
-def fit(case: Case, changes: Sequence[Change]) -> Fits:
+def fit(case: MisfitCase, changes: Sequence[Change]) -> Fits:
     """Return the best fit of each change.
 
     A change with parameters and without starts affects a few rows: its fit starts at the fit without these rows.
 
     Parameters
     ----------
-    case : Case
+    case : MisfitCase
         The problem.
     changes : sequence of Change
         E changes.
@@ -151,7 +151,7 @@ def _without(change: Change) -> Change:
     return replace(change, weight=np.where(affected, 0.0, change.weight), columns=(), moved=-1)
 
 
-def _search(case: Case, changes: Sequence[Change], theta: Array, x: Array) -> Array:
+def _search(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array) -> Array:
     """Return the unknowns (E, K, size) of the best positions of a search; `x` are more starts."""
     lanes, flat = changed(case, changes, theta), x.reshape(-1, x.shape[-1])
     if case.base.layout.shares("position") and case.base.layout.n_shared:
@@ -159,7 +159,7 @@ def _search(case: Case, changes: Sequence[Change], theta: Array, x: Array) -> Ar
     return descend(lanes, flat)[0].reshape(x.shape)
 
 
-def _first_values(case: Case, changes: Sequence[Change], theta: Array, x: Array) -> Array:
+def _first_values(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array) -> Array:
     """Return the least-squares parameters (E, q) at fixed positions `x` (E, K, size)."""
     if not any(change.columns for change in changes):
         return theta
@@ -180,7 +180,7 @@ class _System:
     coupling: Array
 
 
-def _system(case: Case, changes: Sequence[Change], theta: Array, x: Array) -> _System:
+def _system(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array) -> _System:
     """Return the linearised system of all lanes at parameters `theta` (E, q) and unknowns `x` (E, K, size)."""
     lanes, shape = changed(case, changes, theta), x.shape
     flat = x.reshape(-1, shape[-1])
@@ -225,7 +225,7 @@ def _joined(problem: Problem, equations: Normal) -> tuple[Array, Array]:
     return information, vector
 
 
-def _columns(case: Case, lanes: Problem, changes: Sequence[Change], theta: Array, flat: Array) -> Array:
+def _columns(case: MisfitCase, lanes: Problem, changes: Sequence[Change], theta: Array, flat: Array) -> Array:
     """Return the derivatives (L, m, q) of the predictions of `changed` with respect to the parameters."""
     count, k, m = len(changes), len(case.times), case.base.count
     out, scale = np.zeros((count, k, m, theta.shape[1])), np.ones((count, k, m))
@@ -259,7 +259,7 @@ def _solve(information: Array, vector: Array) -> Array:
     return np.asarray((root @ (np.swapaxes(root, -1, -2) @ vector[..., None]))[..., 0])
 
 
-def _reduced(case: Case, system: _System, lanes: Problem, x: Array) -> tuple[Array, Array, Array]:
+def _reduced(case: MisfitCase, system: _System, lanes: Problem, x: Array) -> tuple[Array, Array, Array]:
     """Return information (E, q, q) and right side (E, q) of the parameters, and whether x is determined (E, K)."""
     shape = x.shape
     space = np.broadcast_to(np.eye(shape[-1]), (shape[0] * shape[1], shape[-1], shape[-1]))
@@ -289,7 +289,7 @@ def _reduced(case: Case, system: _System, lanes: Problem, x: Array) -> tuple[Arr
     return total, np.where(weak, 0.0, pull.sum(1)), determined
 
 
-def _descend(case: Case, changes: Sequence[Change], theta: Array, x: Array) -> Fits:
+def _descend(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array) -> Fits:
     """Return the fits from parameters `theta` (E, q) and unknowns `x` (E, K, size), by steps that lower the cost."""
     shape = x.shape
 
@@ -332,7 +332,7 @@ def _bounded(changes: Sequence[Change], theta: Array, step: Array) -> Array:
     return out
 
 
-def _assessed(case: Case, changes: Sequence[Change], theta: Array, x: Array, cost: Array) -> Fits:
+def _assessed(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array, cost: Array) -> Fits:
     """Return the fits, with infinite costs where the data determine no position, and sigmas of the parameters."""
     lanes = changed(case, changes, theta)
     system = _system(case, changes, theta, x)
@@ -348,7 +348,7 @@ def _assessed(case: Case, changes: Sequence[Change], theta: Array, x: Array, cos
     return Fits(x, np.where(used, theta, 0.0), np.where(used, sigma, 0.0), cost)
 
 
-def _is_far(case: Case, x: Array) -> Array:
+def _is_far(case: MisfitCase, x: Array) -> Array:
     """Return flags (E, K) of positions that are so far away that they are only directions."""
     layout = case.base.layout
     if not layout.shares("position"):

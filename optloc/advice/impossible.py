@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.advice.change import Case, Change
+from optloc.advice.change import Change, MisfitCase
 from optloc.advice.fits import fit
 from optloc.advice.wording import no_words
 from optloc.base.types import Array, Rows
@@ -27,7 +27,7 @@ _FITS = 1e-3
 _OUTSIDE = 1e-6
 
 
-def constraint_advice(case: Case) -> Iterator[Advice]:
+def constraint_advice(case: MisfitCase) -> Iterator[Advice]:
     """Yield advice if the values fit without the constraints, but only at positions that violate them."""
     free = replace(case, base=replace(case.base, constraints=()))
     found = fit(free, [Change("constraint", no_words)])
@@ -41,12 +41,12 @@ def constraint_advice(case: Case) -> Iterator[Advice]:
         yield Advice("constraint", seen, "check their values; heights must be above the ellipsoid, not above the sea")
 
 
-def _violation(case: Case, x: Array) -> Array:
+def _violation(case: MisfitCase, x: Array) -> Array:
     """Return the violation (K,) of the constraints at the positions `x` (K, size)."""
     return violation(case.base, x)
 
 
-def _is_refuted(case: Case) -> bool:
+def _is_refuted(case: MisfitCase) -> bool:
     """Return whether the fixes as given do not fit or violate the constraints."""
     if not np.isfinite(case.x).all():
         return True

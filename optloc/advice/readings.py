@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Column, Wording, Words
+from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording, Words
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import bias_lines, size_text
 from optloc.base.types import Array, CompassRows
@@ -27,20 +27,20 @@ _COORDINATE_UNITS = ("km", "cm", "mm", "ft")
 _SPEEDS = (SPEED_OF_LIGHT, 343.0, 1500.0)
 # Relative difference of equal units.
 _SAME_UNIT = 1e-6
-# Rounding of angles, rad: full turns are no more than full turns.
-_ROUNDED = 1e-3
+# Share of a turn by which noise and rounding may exceed it.
+_ROUNDED = 0.01
 # Starts of the scale of all lengths: a speed that is wrong by up to a factor of four.
 _SCALES = (-0.75, -0.5, -0.2, 0.0, 0.25, 1.0, 3.0)
 # Starts of the declination, rad: every 45 degrees.
 _TURNS = tuple(np.radians(np.arange(-135.0, 181.0, 45.0)).tolist())
 
 
-def units(case: Case, suspects: Suspects) -> Iterator[Change]:
+def units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield other units of the lengths and of the angles, each with the noise in the same unit and as stated."""
     lengths = tuple(kind for kind in case.kinds if MODELS[kind].quantity == "length" and MODELS[kind].stations)
     groups = [group for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))) if group]
-    ratios = _ratios()
     for group in groups:
+        ratios = _ratios(case, group)
         rows = np.any([case.rows_of(kind) for kind in group], axis=0)
         for ratio, (stated, meant) in ratios.items():
             words = partial(_unit_words, case, group, stated, meant, ratio)
@@ -52,37 +52,42 @@ def units(case: Case, suspects: Suspects) -> Iterator[Change]:
         yield from _read(case, rows, ratio, words, 2)
 
 
-def _read(case: Case, rows: Array, ratio: float, words: Words, choices: float) -> Iterator[Change]:
+def _read(case: MisfitCase, rows: Array, ratio: float, words: Words, choices: float) -> Iterator[Change]:
     """Yield values times a ratio, with noise times this ratio, and with the stated noise.
 
     The values of compass bearings turn about north.
     """
-    factor, shift = np.where(rows, ratio, 1.0), np.zeros(len(rows))
+    factor, shift = np.where(rows, ratio, 1.0), np.zeros(case.present.shape)
     for i, block in enumerate(case.base.rows):
-        if isinstance(block, CompassRows) and rows[case.part(i)].any():
-            shift[case.part(i)] = np.pi / 2 * (1.0 - ratio)
+        part = case.part(i)
+        if MODELS[block.kind].period is None or not rows[part].any():
+            continue
         # readings of angles are within one turn, so that a larger unit must not make several turns of them
-        if MODELS[block.kind].period is not None and rows[case.part(i)].any():
-            reading = np.where(case.present, ratio * (np.abs(_readings(case)) - _ROUNDED), 0.0)[:, case.part(i)]
-            if np.abs(reading).max() > 2.0 * np.pi:
-                return
+        compass = isinstance(block, CompassRows)
+        z = np.broadcast_to(case.base.z, case.present.shape)[:, part]
+        reading = np.where(case.present[:, part], np.pi / 2 - z if compass else z, 0.0)
+        turns = np.round(reading / (2.0 * np.pi)) if ratio > 1.0 else np.zeros_like(reading)
+        if np.abs(ratio * (reading - 2.0 * np.pi * turns)).max() > 2.0 * np.pi * (1.0 + _ROUNDED):
+            return
+        back = ratio * 2.0 * np.pi * turns
+        shift[:, part] = np.pi / 2 * (1.0 - ratio) + back if compass else -back
     yield Change("unit", words, factor=factor, shift=shift, alternatives=choices)
     # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
     spread = np.where(rows, 1.0 / ratio, 1.0)
     yield Change("unit", words, factor=factor, shift=shift, spread=spread, alternatives=choices)
 
 
-def _readings(case: Case) -> Array:
-    """Return the values (K, m) as they were read: compass bearings clockwise from north."""
-    z = np.array(np.broadcast_to(case.base.z, case.present.shape))
-    for i, block in enumerate(case.base.rows):
-        if isinstance(block, CompassRows):
-            z[:, case.part(i)] = np.pi / 2 - z[:, case.part(i)]
-    return z
+def _ratios(case: MisfitCase, kinds: tuple[str, ...]) -> dict[float, tuple[str, str]]:
+    """Return the stated and the meant unit by the ratio of their sizes; times are multiplied by the wave speed.
 
-
-def _ratios() -> dict[float, tuple[str, str]]:
-    """Return the stated and the meant unit by the ratio of their sizes; times are multiplied by the speed of light."""
+    Without a file, the wave is light and the stated unit is one of a few.
+    """
+    written = case.base.written
+    sizes = {abs(written.units.get(kind, 1.0)) for kind in kinds} if written is not None else set()
+    if written is not None and len(sizes) == 1:
+        size, speed = sizes.pop(), written.speed or SPEED_OF_LIGHT
+        own = {name: UNITS["length"][name] * (speed if name in _TIMES else 1.0) for name in _MEANT_UNITS}
+        return {other / size: ("", name) for name, other in own.items() if abs(other / size - 1.0) > _SAME_UNIT}
     table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
     out: dict[float, tuple[str, str]] = {}
     for stated in _STATED_UNITS:
@@ -94,7 +99,7 @@ def _ratios() -> dict[float, tuple[str, str]]:
 
 
 def _unit_words(
-    case: Case, kinds: tuple[str, ...], stated: str, meant: str, ratio: float, theta: Array, sigma: Array
+    case: MisfitCase, kinds: tuple[str, ...], stated: str, meant: str, ratio: float, theta: Array, sigma: Array
 ) -> Wording:
     written = case.base.written
     sizes = {abs(written.units.get(kind, 1.0)) for kind in kinds} if written is not None else set()
@@ -128,7 +133,7 @@ def _angle_words(kinds: tuple[str, ...], stated: str, meant: str, theta: Array, 
     return Wording(seen, "state their unit", f'unit = "{meant}"\n')
 
 
-def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
+def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the opposite sign of all differences, and of all arrival times."""
     for kind in case.kinds:
         model = MODELS[kind]
@@ -153,7 +158,7 @@ def _sign_words(kind: str, difference: bool, turned: bool, theta: Array, sigma: 
     return Wording(f"{seen}: the counters count down to zero", "write a minus before each value")
 
 
-def senses(case: Case, suspects: Suspects) -> Iterator[Change]:
+def senses(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield other senses of azimuths: compass, anticlockwise from north, clockwise from east, and half a turn."""
     rows = case.rows_of("azimuth")
     if "azimuth" not in case.kinds:
@@ -168,17 +173,19 @@ def senses(case: Case, suspects: Suspects) -> Iterator[Change]:
         yield _sense(rows, "compass", -1.0, half, "as compass bearings", 'azimuth = "north-clockwise"\n')
         yield _sense(rows, "anticlockwise", 1.0, half, "counter-clockwise from north", north)
         degrees = 'unit = "deg"\nazimuth = "north-clockwise"\n'
-        yield _sense(rows, "compass", -np.pi / 180.0, half, "as compass bearings in degrees", degrees)
+        for spread in (1.0, 180.0 / np.pi):
+            yield _sense(rows, "compass", -np.pi / 180.0, half, "as compass bearings in degrees", degrees, spread)
     turned = "from the target to the station, half a turn more"
     yield _sense(rows, "opposite", 1.0, np.pi, turned, 'correction = "180 deg"\n')
 
 
-def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml: str) -> Change:
+def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml: str, spread: float = 1.0) -> Change:
     return Change(
         cause,
         partial(_sense_words, how, toml),
         factor=np.where(rows, factor, 1.0),
         shift=np.where(rows, shift, 0.0),
+        spread=np.where(rows, spread, 1.0),
         alternatives=4,
     )
 
@@ -187,22 +194,22 @@ def _sense_words(how: str, toml: str, theta: Array, sigma: Array) -> Wording:
     return Wording(f"the azimuths do not intersect as read, but they do {how}", "state the convention", toml)
 
 
-def declinations(case: Case, suspects: Suspects) -> Iterator[Change]:
+def declinations(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield one turn of all azimuths."""
     if "azimuth" not in case.kinds or len(case.stations) < 2:
         return
     column = np.broadcast_to(case.coefficients("kind", "offset", "azimuth"), case.present.shape)
     starts = tuple((turn,) for turn in _TURNS)
-    yield Change("declination", partial(_turn_words, case), columns=(Column("adds", column),), starts=starts)
+    yield Change("declination", partial(_turn_words, case), columns=(ErrorColumn("adds", column),), starts=starts)
 
 
-def _turn_words(case: Case, theta: Array, sigma: Array) -> Wording:
+def _turn_words(case: MisfitCase, theta: Array, sigma: Array) -> Wording:
     seen = f"a turn of all azimuths by {size_text(theta[0], sigma[0], 'rad')} would explain the misfit"
     advice = "check north: state the declination, or model the error"
     return Wording(seen, advice, bias_lines(case, "offset", "kind", "azimuth"))
 
 
-def speeds(case: Case, suspects: Suspects) -> Iterator[Change]:
+def speeds(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield one factor of all lengths: another speed of the wave."""
     rows = case.rows_where("length")
     if not case.present[:, rows].any():
@@ -211,10 +218,10 @@ def speeds(case: Case, suspects: Suspects) -> Iterator[Change]:
     column = np.broadcast_to(rows * 1.0, case.present.shape)
     starts = tuple((start,) for start in (*_SCALES, *known))
     kinds = [kind for kind in case.kinds if rows[case.rows_of(kind)].any()]
-    yield Change("speed", partial(_speed_words, case, kinds), columns=(Column("scales", column),), starts=starts)
+    yield Change("speed", partial(_speed_words, case, kinds), columns=(ErrorColumn("scales", column),), starts=starts)
 
 
-def _speed_words(case: Case, kinds: list[str], theta: Array, sigma: Array) -> Wording:
+def _speed_words(case: MisfitCase, kinds: list[str], theta: Array, sigma: Array) -> Wording:
     ratio = 1.0 / (1.0 + theta[0])
     seen = f"the lengths fit if all are multiplied by {ratio:.6g} (± {100.0 * sigma[0] / (1.0 + theta[0]):.2g} %)"
     advice = f"check the speed of the wave, {ratio:.5g} times the stated one, and the unit; until then, model the error"
@@ -238,7 +245,7 @@ def _is_time(size: float, speed: float) -> bool:
     return any(abs(abs(size) / (speed * UNITS["length"][name]) - 1.0) < _SAME_UNIT for name in _TIMES)
 
 
-def coordinate_units(case: Case, suspects: Suspects) -> Iterator[Change]:
+def coordinate_units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield other units of the coordinates of the stations."""
     place = case.base.stations.position
     if case.base.frame.geodetic or not case.present[:, case.rows_where("length")].any():
@@ -256,13 +263,13 @@ def _coordinate_words(stated: str, meant: str, factor: float, theta: Array, sigm
     return Wording(seen, "state the unit of the stations", f'[stations]\nunit = "{meant}"\n')
 
 
-def swapped_coordinates(case: Case, suspects: Suspects) -> Iterator[Change]:
+def swapped_coordinates(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield exchanged latitudes and longitudes of all stations."""
     stations, frame = case.base.stations, case.base.frame
     if not frame.geodetic or stations.position.ndim > 3 or (stations.axes is not None and stations.axes.ndim > 4):
         return
     lat, lon, height = frame.to_geodetic(stations.position)
-    if np.abs(lon).max() > 90.0:
+    if np.abs(lon).max() > np.pi / 2:
         return
     position = frame.from_geodetic(lon, lat, height)
     yield Change("lat-lon", _lat_lon_words, position=position)

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import log_ndtr
 
-from optloc.advice.change import Case, Change, Column, Wording
+from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import row_name
 from optloc.base.types import Array
@@ -27,17 +27,17 @@ _LEVELS = tuple((1.5 * 1.5**i) for i in range(14))
 _FEW = 6
 
 
-def single_outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
+def single_outliers(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield single rows without which the others may fit."""
     yield from _without_rows(case, [(row,) for row in _worst_rows(case)])
 
 
-def pairs_of_outliers(case: Case, suspects: Suspects) -> Iterator[Change]:
+def pairs_of_outliers(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield pairs of rows without which the others may fit."""
     yield from _without_rows(case, [*combinations(_worst_rows(case)[:_PAIRED], 2)])
 
 
-def _without_rows(case: Case, sets: Sequence[tuple[tuple[int, int], ...]]) -> Iterator[Change]:
+def _without_rows(case: MisfitCase, sets: Sequence[tuple[tuple[int, int], ...]]) -> Iterator[Change]:
     """Yield unknown errors of sets of rows; a row has the number of its epoch and its number there."""
     many = int(case.present.sum())
     for pair in sets:
@@ -45,7 +45,7 @@ def _without_rows(case: Case, sets: Sequence[tuple[tuple[int, int], ...]]) -> It
         for epoch, row in pair:
             mark = np.zeros(case.present.shape)
             mark[epoch, row] = 1.0
-            columns.append(Column("adds", mark))
+            columns.append(ErrorColumn("adds", mark))
         yield Change(
             "outlier" if len(pair) == 1 else "outliers",
             partial(_outlier_words, case, pair),
@@ -56,7 +56,7 @@ def _without_rows(case: Case, sets: Sequence[tuple[tuple[int, int], ...]]) -> It
         )
 
 
-def _blamed(case: Case, rows: list[int]) -> list[int]:
+def _blamed(case: MisfitCase, rows: list[int]) -> list[int]:
     """Return the stations of rows, without a reference station that all rows have in common."""
     a, b = case.ends
     ends = {int(i) for row in rows for i in (a[row], b[row]) if i >= 0}
@@ -64,7 +64,7 @@ def _blamed(case: Case, rows: list[int]) -> list[int]:
     return sorted(ends - references if len(references) == 1 and ends - references else ends)
 
 
-def _worst_rows(case: Case) -> list[tuple[int, int]]:
+def _worst_rows(case: MisfitCase) -> list[tuple[int, int]]:
     """Return epoch and number of the rows of the epochs with the largest cost, the largest residuals first."""
     linear = linearise(case.base, case.x)
     size = np.zeros(case.present.shape)
@@ -77,13 +77,13 @@ def _worst_rows(case: Case) -> list[tuple[int, int]]:
     return sorted(rows, key=lambda one: -size[one])[: 4 * _PAIRED]
 
 
-def _outlier_words(case: Case, pair: tuple[tuple[int, int], ...], theta: Array, sigma: Array) -> Wording:
+def _outlier_words(case: MisfitCase, pair: tuple[tuple[int, int], ...], theta: Array, sigma: Array) -> Wording:
     names = " and ".join(row_name(case, *one) for one in pair)
     seen = f"the other rows fit without {names}"
     return Wording(seen, "check this reading, or leave it out" if len(pair) == 1 else "check them, or leave them out")
 
 
-def levels(case: Case, suspects: Suspects) -> Iterator[Change]:
+def levels(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield larger noise of one kind of several, and of one station with many rows."""
     groups = [(f"the {kind} values", kind, (), case.rows_of(kind)) for kind in case.kinds if len(case.kinds) > 1]
     for station in case.stations:
@@ -122,7 +122,7 @@ class LateFit:
     x: Array
 
 
-def late_fit(case: Case) -> LateFit | None:
+def late_fit(case: MisfitCase) -> LateFit | None:
     """Return the fit of values of which a share is late by an exponential delay; None for kinds without delays.
 
     Delays only lengthen a range, an arrival time or a sum of ranges. The density of a row is
@@ -142,7 +142,7 @@ def late_fit(case: Case) -> LateFit | None:
     return min(fits, key=lambda one: one.score)
 
 
-def _alternate(case: Case, share: float, delay: float) -> LateFit:
+def _alternate(case: MisfitCase, share: float, delay: float) -> LateFit:
     """Return the mixture after the alternation, from a share and a mean delay."""
     sigma = np.sqrt(variances(case.base.noise, case.base.count)) * np.ones(case.present.shape)
     sigma = sigma / np.sqrt(np.where(case.present, case.base.weight, 1.0))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.advice.change import Case, Change
+from optloc.advice.change import Change, MisfitCase
 from optloc.advice.fits import Fits
 from optloc.base.types import Array
 from optloc.problem.chart import tail_probability
@@ -81,7 +81,7 @@ def score_of_level(cost: float, dof: int) -> float:
     return dof * (1.0 + float(np.log(cost / dof))) + price_of_level(float(np.sqrt(cost / dof)), dof)
 
 
-def scored(case: Case, changes: list[Change], fits: Fits, odds: list[float]) -> list[Scored]:
+def scored(case: MisfitCase, changes: list[Change], fits: Fits, odds: list[float]) -> list[Scored]:
     """Return the scores of fitted changes; changes that fit no determined position are left out.
 
     `odds` (E,) are the prices of the causes.

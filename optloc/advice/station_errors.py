@@ -9,10 +9,10 @@ from itertools import combinations
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Column, Wording
+from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import bias_lines, quoted, size_text, station_words, unit_of
-from optloc.base.types import Array
+from optloc.base.types import Array, CompassRows
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
 from optloc.problem.bias import family
@@ -30,17 +30,17 @@ _STEP_TIMES, _CUTS, _STEPPED = 6, 12, 2
 _ANGLES = 3
 
 
-def offsets(case: Case, suspects: Suspects) -> Iterator[Change]:
+def offsets(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the offsets of each station, and of all rows of a kind that has one station."""
     yield from suspects.offsets
     for kind in case.kinds:
         if MODELS[kind].stations == 1 and not MODELS[kind].emission and kind != "azimuth":
             column = np.broadcast_to(case.coefficients("kind", "offset", kind), case.present.shape)
             words = partial(_words_of_kind, case, kind)
-            yield Change("offset", words, columns=(Column("adds", column),), starts=((0.0,),))
+            yield Change("offset", words, columns=(ErrorColumn("adds", column),), starts=((0.0,),))
 
 
-def _words_of_kind(case: Case, kind: str, theta: Array, sigma: Array) -> Wording:
+def _words_of_kind(case: MisfitCase, kind: str, theta: Array, sigma: Array) -> Wording:
     size = size_text(theta[0], sigma[0], unit_of(kind))
     seen = f"an offset of all {kind} rows of {size} would explain the misfit"
     return Wording(
@@ -50,18 +50,18 @@ def _words_of_kind(case: Case, kind: str, theta: Array, sigma: Array) -> Wording
     )
 
 
-def scales(case: Case, suspects: Suspects) -> Iterator[Change]:
+def scales(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the scales of the values of single stations."""
     yield from _of_form(case, suspects, "scale", "scales")
 
 
-def drifts(case: Case, suspects: Suspects) -> Iterator[Change]:
+def drifts(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield drifts of single stations, for at least three times."""
     if len(np.unique(case.when[case.present])) > 2:
         yield from _of_form(case, suspects, "drift", "adds")
 
 
-def steps(case: Case, suspects: Suspects) -> Iterator[Change]:
+def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield offsets of single stations that start within a run."""
     times = np.unique(case.when[case.present])
     if len(times) < _STEP_TIMES:
@@ -76,7 +76,7 @@ def steps(case: Case, suspects: Suspects) -> Iterator[Change]:
                 "step",
                 words,
                 (case.names[station],),
-                columns=(Column("adds", column),),
+                columns=(ErrorColumn("adds", column),),
                 starts=((0.0,),),
                 x=suspects.start(station, kind),
                 alternatives=suspects.count * len(cuts),
@@ -84,13 +84,13 @@ def steps(case: Case, suspects: Suspects) -> Iterator[Change]:
             )
 
 
-def _step_words(case: Case, kind: str, name: str, cut: float, theta: Array, sigma: Array) -> Wording:
+def _step_words(case: MisfitCase, kind: str, name: str, cut: float, theta: Array, sigma: Array) -> Wording:
     size = size_text(theta[0], sigma[0], unit_of(kind))
     seen = f"a step of station {name} of {size} from t = {case.origin + cut:.6g} s on would explain the misfit"
     return Wording(seen, "split the run there, or give the later rows another station name")
 
 
-def rotations(case: Case, suspects: Suspects) -> Iterator[Change]:
+def rotations(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield turns of the axes of single stations in space, for a run of shared unknowns or one epoch."""
     base = case.base
     if base.dimension != 3 or len(case.times) > 1:
@@ -108,13 +108,13 @@ def rotations(case: Case, suspects: Suspects) -> Iterator[Change]:
             yield Change("rotation", words, (name,), base=other, extra=_ANGLES, alternatives=len(case.stations))
 
 
-def _rotation_words(case: Case, name: str, theta: Array, sigma: Array) -> Wording:
+def _rotation_words(case: MisfitCase, name: str, theta: Array, sigma: Array) -> Wording:
     lines = f'[[biases]]\nname = "rotation"\nform = "rotation"\nper = "station"\nmembers = [{quoted(name)}]\n'
     seen = f"a rotation of the axes of station {name} would explain the misfit"
     return Wording(seen, "check its orientation; until then, model the error", lines)
 
 
-def _of_form(case: Case, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
+def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
     for station, kind in suspects.first(_TRIED):
         if form == "scale" and MODELS[kind].period is not None:
             continue
@@ -125,13 +125,13 @@ def _of_form(case: Case, suspects: Suspects, form: str, enters: str) -> Iterator
             form,
             words,
             (case.names[station],),
-            columns=(Column(enters, column),),  # type: ignore[arg-type]
+            columns=(ErrorColumn(enters, column),),  # type: ignore[arg-type]
             x=suspects.start(station, kind),
             alternatives=suspects.count,
         )
 
 
-def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
+def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the opposite sign of the values of single stations."""
     for station, kind in suspects.first(_TRIED):
         rows = case.rows_at(station) & case.rows_of(kind)
@@ -145,17 +145,27 @@ def signs(case: Case, suspects: Suspects) -> Iterator[Change]:
             words,
             (case.names[station],),
             factor=np.where(rows, -1.0, 1.0),
+            shift=_turned_back(case, rows),
             x=suspects.start(station, kind),
             alternatives=suspects.count,
         )
 
 
-def _sign_words(case: Case, name: str, kind: str, theta: Array, sigma: Array) -> Wording:
+def _turned_back(case: MisfitCase, rows: Array) -> Array:
+    """Return the shift (m,) of values with the opposite sign: compass readings turn about north."""
+    out = np.zeros(len(rows))
+    for i, block in enumerate(case.base.rows):
+        if isinstance(block, CompassRows):
+            out[case.part(i)] = np.where(rows[case.part(i)], np.pi, 0.0)
+    return out
+
+
+def _sign_words(case: MisfitCase, name: str, kind: str, theta: Array, sigma: Array) -> Wording:
     seen = f"the {kind} values of station {name} fit with the opposite sign"
     return Wording(seen, "change the sign of these values, and check the cables of this station")
 
 
-def periods(case: Case, suspects: Suspects) -> Iterator[Change]:
+def periods(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield errors of single stations that are a whole number of periods of a code or a clock, or half a turn."""
     for change, value, sigma in suspects.estimates(_TRIED):
         kind = change.kind
@@ -176,7 +186,7 @@ def periods(case: Case, suspects: Suspects) -> Iterator[Change]:
 
 
 def _period_words(
-    case: Case, name: str, kind: str, count: int, period: str, size: float, theta: Array, sigma: Array
+    case: MisfitCase, name: str, kind: str, count: int, period: str, size: float, theta: Array, sigma: Array
 ) -> Wording:
     times = "" if abs(count) == 1 else f"{abs(count)} times "
     seen = f"the {kind} values of station {name} are {'larger' if count > 0 else 'smaller'} by {times}{period}"
@@ -186,7 +196,7 @@ def _period_words(
     return Wording(seen, "check the clock of this station; until then, correct the values", lines)
 
 
-def exchanges(case: Case, suspects: Suspects) -> Iterator[Change]:
+def exchanges(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield pairs of stations with exchanged names."""
     place = case.base.stations.position
     if place.ndim > 3 or place.shape[-3] > 1 or len(case.stations) < 3:
@@ -206,7 +216,7 @@ def _exchange_words(names: tuple[str, str], theta: Array, sigma: Array) -> Wordi
     return Wording(seen, f"exchange the positions of {names[0]} and {names[1]}, or their names in the measurements")
 
 
-def references(case: Case, suspects: Suspects) -> Iterator[Change]:
+def references(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield other reference stations of differences that all have the same second station."""
     place = case.base.stations.position
     _, b = case.ends
@@ -228,16 +238,18 @@ def _reference_words(name: str, stated: str, theta: Array, sigma: Array) -> Word
     return Wording(seen, f'state b = "{name}" in these rows, and remove the row of {name}')
 
 
-def moves(case: Case, suspects: Suspects) -> Iterator[Change]:
+def moves(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield wrong positions of single stations, if a station has more rows than coordinates."""
     place = case.base.stations.position
     if place.ndim > 3 or place.shape[-3] > 1:
         return
     for station, kind in {s: (s, kind) for s, kind in reversed(suspects.first(_TRIED))}.values():
-        if int(case.present[:, case.rows_at(station)].sum()) < case.base.dimension + 2:
+        if int(case.present[:, case.rows_at(station)].sum()) < case.base.dimension + 1:
             continue
         words = partial(_move_words, case, station)
-        start = ((0.0,) * case.base.dimension,)
+        steps = case.extent * np.eye(case.base.dimension)
+        aside = np.concatenate([np.zeros((1, case.base.dimension)), steps, -steps])
+        start = tuple(tuple(each) for each in aside.tolist())
         yield Change(
             "moved",
             words,
@@ -249,7 +261,7 @@ def moves(case: Case, suspects: Suspects) -> Iterator[Change]:
         )
 
 
-def _move_words(case: Case, station: int, theta: Array, sigma: Array) -> Wording:
+def _move_words(case: MisfitCase, station: int, theta: Array, sigma: Array) -> Wording:
     place = case.base.stations.position.reshape(-1, case.base.dimension)[station] + theta
     text = ", ".join(f"{v:.6g}" for v in place)
     seen = f"station {case.names[station]} would fit {np.linalg.norm(theta):.4g} m away from its stated position"

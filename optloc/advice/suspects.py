@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Column
+from optloc.advice.change import Change, ErrorColumn, MisfitCase
 from optloc.advice.fits import Fits, fit
 from optloc.advice.wording import station_words
 from optloc.base.types import Array
@@ -20,11 +20,11 @@ class Suspects:
 
     Parameters
     ----------
-    case : Case
+    case : MisfitCase
         The problem.
     """
 
-    case: Case
+    case: MisfitCase
 
     @cached_property
     def _stated(self) -> tuple[Change, ...]:
@@ -32,7 +32,7 @@ class Suspects:
         case, out = self.case, []
         for station, kind in self.channels:
             own = case.coefficients("station", "offset", kind, case.names[station])
-            column = Column("adds", np.broadcast_to(own, case.present.shape))
+            column = ErrorColumn("adds", np.broadcast_to(own, case.present.shape))
             left = (case.present & (own == 0.0)).sum(1)
             # without these rows, the others determine no position: for instance without the reference station
             starts = ((0.0,),) if (left < case.present.sum(1) - case.dof).any() else ()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.advice.change import Case
+from optloc.advice.change import MisfitCase
 from optloc.advice.fits import changed
 from optloc.advice.scores import Scored
 from optloc.problem.problem import Problem
@@ -19,7 +19,7 @@ _METHOD = "roots+lsr+add_candidates+lsr"
 _SAME = 0.1
 
 
-def verified(case: Case, found: Sequence[Scored]) -> tuple[Scored, ...]:
+def verified(case: MisfitCase, found: Sequence[Scored]) -> tuple[Scored, ...]:
     """Return the explanations with the cost of a solution after the change, without those that it does not confirm.
 
     A solver starts without the result of the comparison. If it finds a better position, its cost counts.
@@ -35,12 +35,12 @@ def verified(case: Case, found: Sequence[Scored]) -> tuple[Scored, ...]:
     return tuple(sorted(out, key=lambda one: one.score))
 
 
-def solved_cost(case: Case, one: Scored) -> float:
+def solved_cost(case: MisfitCase, one: Scored) -> float:
     """Return the cost of a solution after a change, with its parameters as estimated; infinite if it fails."""
     return float(np.sum(solve(_problem(case, one), _METHOD).cost))
 
 
-def _problem(case: Case, one: Scored) -> Problem:
+def _problem(case: MisfitCase, one: Scored) -> Problem:
     """Return the problems (K,) after a change."""
     own = case if one.change.base is None else replace(case, base=one.change.base)
     return changed(own, [one.change], one.theta[None])

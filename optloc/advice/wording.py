@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optloc.advice.change import Case, Wording
+from optloc.advice.change import MisfitCase, Wording
 from optloc.base.types import Array
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS
@@ -31,7 +31,7 @@ def unit_of(kind: str) -> str:
 
 
 def bias_lines(
-    case: Case, form: str, per: str, kind: str, members: Sequence[str] = (), mean: str = "", sigma: str = ""
+    case: MisfitCase, form: str, per: str, kind: str, members: Sequence[str] = (), mean: str = "", sigma: str = ""
 ) -> str:
     """Return the lines of a problem file that model an error as a bias."""
     used = {bias.name for bias in case.base.biases}
@@ -42,7 +42,7 @@ def bias_lines(
     return "\n".join(["[[biases]]", *lines]) + "\n"
 
 
-def row_name(case: Case, epoch: int, row: int) -> str:
+def row_name(case: MisfitCase, epoch: int, row: int) -> str:
     """Return a name of a row, such as "tdoa of S3 and S1 (row 4)"."""
     a, b = case.ends
     kinds = np.concatenate([np.full(rows.count, rows.kind) for rows in case.base.rows])
@@ -51,7 +51,7 @@ def row_name(case: Case, epoch: int, row: int) -> str:
     return f"the {kinds[row]} of {' and '.join(ends)}{when} (row {case.number[epoch, row] + 1})"
 
 
-def station_words(case: Case, form: str, kind: str, name: str, theta: Array, sigma: Array) -> Wording:
+def station_words(case: MisfitCase, form: str, kind: str, name: str, theta: Array, sigma: Array) -> Wording:
     """Return the text about an offset, scale or drift of one station."""
     unit = {"scale": "", "drift": f"{unit_of(kind)}/s"}.get(form, unit_of(kind))
     size = size_text(theta[0], sigma[0], unit)

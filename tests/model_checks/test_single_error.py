@@ -10,11 +10,11 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import Status
+from optloc.advice.advising import advise_at
 from optloc.cli import app
 from optloc.files import load
-from optloc.advice.advising import advise_at
-from optloc.model_checks.single_error import explained, misfit_of
 from optloc.model_checks.score import FALSE_ALARM, Candidate, explain_misfit
+from optloc.model_checks.single_error import explained, misfit_of
 from optloc.problem.epochs import cut, some_epochs
 from tests.monte_carlo.tables import write
 

@@ -8,15 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from optloc.advice.change import Case, Change, Wording
+from optloc.advice.change import Change, MisfitCase, Wording
 from optloc.advice.suspects import Suspects
-from optloc.base.types import Array, Band
+from optloc.base.types import Array, Band, Constraint
 from optloc.linear.constraints import is_exact
 from optloc.models import MODELS
 from optloc.problem.problem import Problem
 
 
-def heights(case: Case, suspects: Suspects) -> Iterator[Change]:
+def heights(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield a free height of the target: outside the plane of a problem in two dimensions, or off its exact height."""
     base, k = case.base, len(case.times)
     if base.dimension == 2:
@@ -24,13 +24,22 @@ def heights(case: Case, suspects: Suspects) -> Iterator[Change]:
         if all(model.ranges is not None and model.quantity == "length" for model in kinds) and _plain(base):
             yield Change("height", _slant_words, base=_in_space(base), extra=k)
         return
-    free = tuple(c for c in base.constraints if not (isinstance(c, Band) and is_exact(c) and c.kind == "height"))
+    free = tuple(c for c in base.constraints if not _is_height(c))
     if len(free) < len(base.constraints):
         yield Change("height", _height_words, base=replace(base, constraints=free), extra=k)
     elif any(isinstance(c, Band) and is_exact(c) for c in base.constraints):
         count = sum(isinstance(c, Band) and is_exact(c) for c in base.constraints)
         words = partial(_constraint_words, ", ".join(dict.fromkeys(c.name for c in base.constraints)))
         yield Change("constraint", words, base=replace(base, constraints=()), extra=k * count)
+
+
+def _is_height(constraint: Constraint) -> bool:
+    """Return whether a constraint is an exact height, above the ellipsoid or along the third axis."""
+    if not isinstance(constraint, Band) or not is_exact(constraint):
+        return False
+    return constraint.kind == "height" or (
+        constraint.kind == "plane" and np.array_equal(constraint.coefficients, (0.0, 0.0, 1.0))
+    )
 
 
 def _constraint_words(names: str, theta: Array, sigma: Array) -> Wording:

@@ -1,0 +1,30 @@
+"""All explanations compete: one is given if it leads by the gap, several are listed if the data do not decide."""
+
+import numpy as np
+from advice.cases import PLACES, TRUTHS, at, range_case
+
+from optloc.advice.causes import advice_on, causes_of
+from optloc.advice.scores import GAP
+
+
+def test_clean_data_have_no_cause():
+    assert causes_of(range_case(epochs=3)[0]) == ()
+
+
+def test_an_offset_is_first_with_its_station_and_size():
+    one = next(advice_on(causes_of(range_case(at(3, 90.0), epochs=3)[0])))
+    assert (one.cause, one.station) == ("offset", ("S3",))
+    assert abs(one.value[0] - 90.0) < 15.0
+
+
+def test_noise_that_is_understated_is_no_wrong_station():
+    noise = 20.0 * np.random.default_rng(5).normal(size=(4, 7))
+    (one,) = advice_on(causes_of(range_case(noise, epochs=4)[0]))
+    assert (one.cause, one.station, one.gap) == ("noise", (), GAP)
+
+
+def test_causes_that_the_data_do_not_separate_are_listed_with_their_gaps():
+    right = np.linalg.norm(TRUTHS[:1, None] - PLACES, axis=-1)
+    found = list(advice_on(causes_of(range_case(-0.999 * right, sigma=0.003)[0])))
+    assert [one.cause for one in found] == ["unit", "coordinate-unit"]
+    assert found[0].gap >= 0.0 >= found[1].gap
