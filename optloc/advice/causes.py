@@ -101,10 +101,12 @@ def _promising(case: MisfitCase, changes: Sequence[Change], numbers: list[int]) 
 def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:
     """Return the explanation that all noise is understated."""
     level = float(np.sqrt(cost / dof))
+    # a weight changes the variances of rows, and not their covariances
+    simple = len(case.kinds) == 1 and all(block.row.shape[1] == 1 for block in case.base.noise.blocks)
 
     def words(theta: Array, sigma: Array) -> Wording:
         seen = f"noise that is {level:.3g} times as large as stated would explain the misfit"
-        lines = f"weight = {level**-2:.6g}\n" if len(case.kinds) == 1 else ""
+        lines = f"weight = {level**-2:.6g}\n" if simple else ""
         return Wording(seen, "state a larger noise, or use `--rescale-noise` for several epochs", lines)
 
     none = np.zeros(0)
@@ -128,7 +130,8 @@ def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:
 
     `found` is in ascending order of the score.
     """
-    names, kept = list(EXPLANATIONS), []
+    names = list(EXPLANATIONS)
+    kept: list[Scored] = []
     for one in found:
         if one.score > found[0].score + GAP:
             break

@@ -294,7 +294,7 @@ def _descend(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array
     shape = x.shape
 
     def settle(values: Array, places: Array, items: Array) -> tuple[Array, Array]:
-        some = [changes[i] for i in items]
+        some = [changes[int(i)] for i in items]
         lanes = changed(case, some, values)
         y, cost = descend(lanes, places.reshape(-1, shape[-1]))
         return y.reshape(-1, *shape[1:]), np.where(np.isfinite(cost), cost, np.inf).reshape(-1, shape[1])
@@ -344,7 +344,8 @@ def _assessed(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Arra
     sigma = np.sqrt(np.where(used & (np.diagonal(information, axis1=-2, axis2=-1) > 0.0), variance, np.inf))
     cost = np.where(determined & ~_is_far(case, x), cost, np.inf)
     # a parameter without information changes nothing, so that the change is no explanation
-    cost = np.where((used & ~np.isfinite(sigma)).any(-1)[:, None], np.inf, cost)
+    open_parameter = np.asarray(used & ~np.isfinite(sigma)).any(-1)
+    cost = np.where(open_parameter[:, None], np.inf, cost)
     return Fits(x, np.where(used, theta, 0.0), np.where(used, sigma, 0.0), cost)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -36,7 +37,12 @@ _TURNS = tuple(np.radians(np.arange(-135.0, 181.0, 45.0)).tolist())
 
 
 def units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
-    """Yield other units of the lengths and of the angles, each with the noise in the same unit and as stated."""
+    """Yield other units of the lengths and of the angles, each with the noise in the same unit or as stated."""
+    yield from _as_lines(case, _units(case))
+
+
+def _units(case: MisfitCase) -> Iterator[Change]:
+    """Yield other units."""
     lengths = tuple(kind for kind in case.kinds if MODELS[kind].quantity == "length" and MODELS[kind].stations)
     groups = [group for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))) if group]
     for group in groups:
@@ -71,10 +77,13 @@ def _read(case: MisfitCase, rows: Array, ratio: float, words: Words, choices: fl
             return
         back = ratio * 2.0 * np.pi * turns
         shift[:, part] = np.pi / 2 * (1.0 - ratio) + back if compass else -back
-    yield Change("unit", words, factor=factor, shift=shift, alternatives=choices)
+    written = case.base.written
+    if written is None or not written.noise_has_unit:
+        yield Change("unit", words, factor=factor, shift=shift, alternatives=choices)
     # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
     spread = np.where(rows, 1.0 / ratio, 1.0)
-    yield Change("unit", words, factor=factor, shift=shift, spread=spread, alternatives=choices)
+    if written is None or written.noise_has_unit:
+        yield Change("unit", words, factor=factor, shift=shift, spread=spread, alternatives=choices)
 
 
 def _ratios(case: MisfitCase, kinds: tuple[str, ...]) -> dict[float, tuple[str, str]]:
@@ -159,7 +168,24 @@ def _sign_words(kind: str, difference: bool, turned: bool, theta: Array, sigma: 
 
 
 def senses(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
-    """Yield other senses of azimuths: compass, anticlockwise from north, clockwise from east, and half a turn."""
+    """Yield other senses of azimuths: compass, anticlockwise from north, and half a turn."""
+    yield from _as_lines(case, _senses(case))
+
+
+def _as_lines(case: MisfitCase, changes: Iterator[Change]) -> Iterator[Change]:
+    """Yield changes with keys of `[[measurements]]`, which stay lines only if the file has one kind of rows."""
+
+    def sentence(words: Words, theta: Array, sigma: Array) -> Wording:
+        text = words(theta, sigma)
+        keys = text.toml.strip().replace("\n", " and ")
+        return replace(text, advice=f"{text.advice}: {keys} in the table of these rows", toml="") if keys else text
+
+    for change in changes:
+        yield change if len(case.kinds) == 1 else replace(change, words=partial(sentence, change.words))
+
+
+def _senses(case: MisfitCase) -> Iterator[Change]:
+    """Yield other senses of azimuths."""
     rows = case.rows_of("azimuth")
     if "azimuth" not in case.kinds:
         return
@@ -231,7 +257,7 @@ def _speed_words(case: MisfitCase, kinds: list[str], theta: Array, sigma: Array)
         and written.speed
         and all(_is_time(written.units.get(kind, 1.0), written.speed) for kind in kinds)
     ):
-        speed = written.speed * ratio
+        speed = float(written.speed * ratio)
         seen = f"the times fit with a wave speed of {speed:.6g} m/s instead of {written.speed:.6g} m/s"
         return Wording(
             seen, "check the speed of the wave", f"propagation_speed = {speed!r}\n", f"--wave-speed '{speed:.9g} m/s'"
@@ -260,7 +286,7 @@ def coordinate_units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
 
 def _coordinate_words(stated: str, meant: str, factor: float, theta: Array, sigma: Array) -> Wording:
     seen = f"the values fit with coordinates of stations in {meant} instead of {stated}, {factor:.4g} times as large"
-    return Wording(seen, "state the unit of the stations", f'[stations]\nunit = "{meant}"\n')
+    return Wording(seen, f'state their unit: unit = "{meant}" in the table of the stations')
 
 
 def swapped_coordinates(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:

@@ -85,7 +85,9 @@ def _outlier_words(case: MisfitCase, pair: tuple[tuple[int, int], ...], theta: A
 
 def levels(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield larger noise of one kind of several, and of one station with many rows."""
-    groups = [(f"the {kind} values", kind, (), case.rows_of(kind)) for kind in case.kinds if len(case.kinds) > 1]
+    groups: list[tuple[str, str, tuple[str, ...], Array]] = [
+        (f"the {kind} values", kind, (), case.rows_of(kind)) for kind in case.kinds if len(case.kinds) > 1
+    ]
     for station in case.stations:
         rows = case.rows_at(station)
         if int(case.present[:, rows].sum()) >= _FEW and not rows[case.present.any(0)].all():
@@ -93,14 +95,13 @@ def levels(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     for what, kind, names, rows in groups:
         for level in _LEVELS:
             spread = np.where(rows, level, 1.0)
-            words = partial(_level_words, what, kind, level)
+            words = partial(_level_words, what, level)
             yield Change("noise", words, names, spread=spread, levels=True, alternatives=len(groups), kind=kind)
 
 
-def _level_words(what: str, kind: str, level: float, theta: Array, sigma: Array) -> Wording:
+def _level_words(what: str, level: float, theta: Array, sigma: Array) -> Wording:
     seen = f"the noise of {what} would explain the misfit if it were about {level:.2g} times as large as stated"
-    lines = f"weight = {level**-2:.6g}\n" if kind else ""
-    return Wording(seen, "state its noise", lines)
+    return Wording(seen, "state its noise")
 
 
 # Late signals.

@@ -161,7 +161,8 @@ class Draft:
         found = warnings_of(self.loaded.problem, self.chunks, self.numbers, surface, self.loaded.source)
         units = {chunk.kind: float(chunk.unit.factor) for chunk in self.chunks}
         speed = self.chunks[0].units.speed if self.chunks else None
-        problem = replace(self.loaded.problem, written=Written(units, speed))
+        own = any(isinstance(one, str) for each in self.file.measurements for one in (each.sigma, each.arrival_sigma))
+        problem = replace(self.loaded.problem, written=Written(units, speed, own))
         more = unused_picks(self.chunks, problem.stations.names)
         return replace(self.loaded, problem=problem, warnings=found + more)
 

@@ -16,7 +16,10 @@ class Written:
         Size of one unit of the values by kind, in SI units; negative if the sign of the values is turned.
     speed : float, optional
         Speed, m/s, by which times are multiplied.
+    noise_has_unit : bool
+        Whether the noise is text with a unit of its own, so that it stays if the unit of the values changes.
     """
 
     units: Mapping[str, float] = field(default_factory=dict)
     speed: float | None = None
+    noise_has_unit: bool = False
