@@ -274,7 +274,8 @@ def noise_of_station(rng: np.random.Generator, scene: Scene, data: Data) -> Plan
 
 def unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
     if "azimuth" in data.kind:
-        planted = data.with_unit(data.of("azimuth"), 1.0, np.pi / 180.0)
+        turned = replace(data, z=data.z % (2.0 * np.pi))
+        planted = turned.with_unit(data.of("azimuth"), 1.0, np.pi / 180.0)
         return planted, (), np.pi / 180.0
     meant = [u for u in ("m", "km", "cm", "mm", "ft") if u != data.unit]
     meant += [u for u in (("us", "ns") if data.speed == LIGHT else ("s", "ms")) if u != data.unit]
