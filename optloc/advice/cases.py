@@ -59,7 +59,7 @@ def _by_epoch(problem: Problem, base: Problem, x: Array) -> Array:
 
 
 def _sample(base: Problem, x: Array, dof: Array) -> Array:
-    """Return the numbers of at most `_EPOCHS` epochs with redundancy: evenly spread ones, and those of largest cost."""
+    """Return the numbers of at most `_EPOCHS` epochs with redundancy: evenly spread, or with a large cost."""
     able = np.flatnonzero(dof > 0)
     if len(able) <= _EPOCHS:
         return able

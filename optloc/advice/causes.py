@@ -16,6 +16,7 @@ from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_leve
 from optloc.advice.suspects import Suspects
 from optloc.advice.wording import no_words
 from optloc.base.types import Array
+from optloc.kernels.sums import equations_at
 from optloc.model_checks.cause import Advice
 
 # Smallest price of any explanation: a misfit of a smaller cost has no cause.
@@ -35,6 +36,11 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     """
     plain = fit(case, [Change("none", no_words)])
     cost, dof = float(plain.cost.sum()), int(case.dof.sum())
+    if not np.isfinite(cost):
+        # a position that the data determine badly, such as one in the plane of the stations, has a cost all the same
+        cost = float(equations_at(case.base, case.x).cost.sum()) if np.isfinite(case.x).all() else np.inf
+    if not np.isfinite(cost):
+        return ()
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
     case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
@@ -70,7 +76,7 @@ def all_scores(case: MisfitCase) -> list[Scored]:
 
 
 def _in_base(case: MisfitCase, change: Change) -> MisfitCase:
-    """Return the case in the structure of a change that has its own."""
+    """Return the case in the structure that a change states."""
     assert change.base is not None
     x = np.zeros((len(case.times), change.base.layout.size))
     new, old = change.base.layout, case.base.layout

@@ -80,7 +80,7 @@ def _read(case: MisfitCase, rows: Array, ratio: float, words: Words, choices: fl
     written = case.base.written
     if written is None or not written.noise_has_unit:
         yield Change("unit", words, factor=factor, shift=shift, alternatives=choices)
-    # a noise with a unit of its own stays: in the recorded unit it is larger by the inverse of the ratio
+    # a noise that is stated with a unit stays: in the recorded unit it is larger by the inverse of the ratio
     spread = np.where(rows, 1.0 / ratio, 1.0)
     if written is None or written.noise_has_unit:
         yield Change("unit", words, factor=factor, shift=shift, spread=spread, alternatives=choices)

@@ -20,7 +20,7 @@ from optloc.models import MODELS
 from optloc.problem.noise import variances
 
 # Epochs with the largest cost whose rows may be outliers, and the largest number of rows of which pairs are tried.
-_EPOCHS, _PAIRED = 3, 8
+_EPOCHS, _PAIRED = 3, 12
 # Factors of the noise that are tried; between two of them, the likelihood changes by less than one.
 _LEVELS = tuple((1.5 * 1.5**i) for i in range(14))
 # A station needs this number of rows for a noise level: fewer rows do not distinguish noise from outliers.
@@ -73,8 +73,10 @@ def _worst_rows(case: MisfitCase) -> list[tuple[int, int]]:
         size[:, whitener.row.ravel()] = np.abs(white)
     size = np.where(np.isfinite(size), size, 0.0)
     epochs = np.argsort(-(size**2).sum(1), kind="stable")[:_EPOCHS]
-    rows = [(int(k), int(i)) for k in epochs for i in np.flatnonzero(case.present[k])]
-    return sorted(rows, key=lambda one: -size[one])[: 4 * _PAIRED]
+    # a gross row enlarges all residuals of its epoch, so that the rows of each epoch are ordered separately
+    orders = [[(int(k), int(i)) for i in np.argsort(-size[k], kind="stable") if case.present[k, i]] for k in epochs]
+    rows = [order[i] for i in range(case.base.count) for order in orders if i < len(order)]
+    return rows[: 4 * _PAIRED]
 
 
 def _outlier_words(case: MisfitCase, pair: tuple[tuple[int, int], ...], theta: Array, sigma: Array) -> Wording:

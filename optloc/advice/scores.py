@@ -23,7 +23,7 @@ GAP = 9.0
 # Prior of the size of an error: uniform in its logarithm, over four decades and both signs. The density at the size t,
 # in sigmas, is 1 / (2 ln(1e4) t), and the likelihood integrates to sqrt(2 pi).
 _DENSITY = 2.0 * np.log(1e4) / np.sqrt(2.0 * np.pi)
-# Smallest size that has a price of its own: smaller errors are not distinguished from none.
+# Smallest size that has a separate price: smaller errors are not distinguished from none.
 _LEAST = 3.0
 # Prior spread of the logarithm of a wrong noise level: a factor of four and a half is one sigma.
 _LEVEL = 1.5

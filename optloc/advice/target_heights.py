@@ -48,7 +48,7 @@ def _constraint_words(names: str, theta: Array, sigma: Array) -> Wording:
 
 
 def _plain(base: Problem) -> bool:
-    """Return whether a problem has nothing but static stations and rows, so that a third axis can be added."""
+    """Return whether a problem has only static stations and rows, so that a third axis can be added."""
     s = base.stations
     parts = (s.velocity, s.axes, s.covariance, s.velocity_covariance)
     motion = base.motions[0]

@@ -13,8 +13,8 @@ from optloc.advice.scores import Scored
 from optloc.problem.problem import Problem
 from optloc.solvers.solution import solve
 
-# Method of the solution: the starts of `auto`, without its proof.
-_METHOD = "roots+lsr+add_candidates+lsr"
+# Method of the solution: the starts and the search of `auto`, without its proof.
+_METHOD = "searched"
 # Difference of costs that changes no decision.
 _SAME = 0.1
 

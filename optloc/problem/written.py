@@ -17,7 +17,7 @@ class Written:
     speed : float, optional
         Speed, m/s, by which times are multiplied.
     noise_has_unit : bool
-        Whether the noise is text with a unit of its own, so that it stays if the unit of the values changes.
+        Whether the noise is text with a separate unit, so that it stays if the unit of the values changes.
     """
 
     units: Mapping[str, float] = field(default_factory=dict)
