@@ -39,8 +39,6 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     if not np.isfinite(cost):
         # a position that the data determine badly, such as one in the plane of the stations, has a cost all the same
         cost = float(equations_at(case.base, case.x).cost.sum()) if np.isfinite(case.x).all() else np.inf
-    if not np.isfinite(cost):
-        return ()
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
     case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
