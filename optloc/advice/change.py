@@ -1,7 +1,7 @@
 """A small change of a problem that may explain its misfit: other values, noise, weights, stations or unknown errors.
 
-Letters: K epochs that are fixed separately (1 for a run with shared unknowns), m rows of each, s stations, d
-coordinates, q parameters of a change.
+Letters: K epochs that are fixed separately, or K = 1 for a run with shared unknowns. Each epoch has m rows. There are s
+stations, d coordinates, and q parameters of a change.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _FLAT = 1e-6
 _REFUTED = 1e-4
 # Share of the extent of the stations that is rounding of their coordinates.
 _ROUNDING = 1e-12
-# Height of stations above the ellipsoid, m, below which they may float or stand on the sea floor: without a map of the
+# Height of stations above the ellipsoid, m, below which they may be in the sea: without a map of the
 # ground, a target below them is possible.
 _DRY = 0.5
 # Cosine above which a normal counts as an axis of the frame, so that a box can exclude one side of the plane.

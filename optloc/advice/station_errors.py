@@ -24,7 +24,7 @@ _PAIRS = 8
 # Periods of codes and clocks, s: GPS C/A code, GPS data bit, second. Their multiples up to the third are tried.
 _PERIODS = {"1 ms, the period of a code": 1e-3, "20 ms": 2e-2, "1 s": 1.0}
 _MULTIPLES = 3
-# Least number of times of a run for steps, the number of times at which a step may start, and of stations with steps.
+# For steps: least number of times of a run, number of times at which a step may start, and number of stations tried.
 _STEP_TIMES, _CUTS, _STEPPED = 6, 12, 2
 # Number of angles of a rotation in space.
 _ANGLES = 3
