@@ -93,8 +93,9 @@ def _readings(data: Data) -> list[Change]:
         }
         out += [Change(cause, (), changed, ODDS) for cause, changed in turned.items()]
         # numbers above a full turn are no radians
-        if np.abs(np.degrees(data.z[:, bearing])).max() < 2.1 * np.pi:
-            out.append(Change("unit", (), data.with_unit(bearing, 1.0, 180.0 / np.pi), ODDS))
+        written = replace(data, z=np.where(bearing, data.z % (2.0 * np.pi), data.z))
+        if np.degrees(written.z[:, bearing]).max() < 2.1 * np.pi:
+            out.append(Change("unit", (), written.with_unit(bearing, 1.0, 180.0 / np.pi), ODDS))
     if data.kind[0] in ("tdoa", "toa"):
         out.append(Change("sign", (), replace(data, z=-data.z), ODDS))
     if data.geodetic is not None and np.abs(data.geodetic[:, 1]).max() < 90.0:

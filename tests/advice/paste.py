@@ -6,22 +6,37 @@ import re
 
 TOP = frozenset({"propagation_speed", "wind", "covariance", "title"})
 """Keys that stand before the first table of a file."""
+_AZIMUTHS, _DIFFERENCES = ('kind = "azimuth"', 'kind = "bearing"'), ('kind = "tdoa"', 'kind = "groa"')
+KINDS = {"azimuth": _AZIMUTHS, "declination": _AZIMUTHS, "positive": _DIFFERENCES}
+"""Lines of the tables of measurements into which a key belongs; all tables without an entry."""
 
 
 def pasted(text: str, lines: str) -> str:
     """Return the text of a problem file with the lines of a suggestion.
 
-    Keys before the first header of the lines belong to each table of measurements, or to the top of the file. They
-    replace keys of the same name. Tables with a header are appended at the end.
+    Keys before the first header of the lines belong to the tables of measurements, or to the top of the file. Keys
+    below a header that the file has, such as ``[stations]``, go there. Keys replace keys of the same name. Other tables
+    are appended at the end.
     """
-    start = re.search(r"^\[", lines, re.MULTILINE)
-    keys, tables = (lines[: start.start()], lines[start.start() :]) if start else (lines, "")
-    for line in keys.splitlines():
-        key = line.partition("=")[0].strip()
-        if key in TOP:
-            text = re.sub(rf"^{key}\s*=.*\n", "", text, flags=re.MULTILINE)
-            text = f"{line}\n{text}"
-        elif key:
-            text = re.sub(rf"^{key}\s*=.*\n", "", text, flags=re.MULTILINE)
-            text = text.replace("[[measurements]]\n", f"[[measurements]]\n{line}\n")
-    return f"{text}\n{tables}" if tables else text
+    blocks = re.split(r"^(?=\[)", text, flags=re.MULTILINE)
+    added = []
+    for part in re.split(r"^(?=\[)", lines, flags=re.MULTILINE):
+        header, _, rest = part.partition("\n") if part.startswith("[") else ("", "", part)
+        if header.startswith("[["):
+            added.append(part)
+            continue
+        for line in filter(None, map(str.strip, rest.splitlines())):
+            key = line.partition("=")[0].strip()
+            wanted = header or ("" if key in TOP else "[[measurements]]")
+            kinds = KINDS.get(key, ("",))
+            for i, block in enumerate(blocks):
+                if (block.startswith(wanted) if wanted else i == 0) and any(kind in block for kind in kinds):
+                    blocks[i] = _with_key(block, key, line)
+    return "".join(blocks) + "".join(f"\n{one}" for one in added)
+
+
+def _with_key(block: str, key: str, line: str) -> str:
+    """Return a table with a line for a key, in the place of the line that has the key."""
+    block = re.sub(rf"^{key}\s*=.*\n", "", block, flags=re.MULTILINE)
+    head, _, rest = block.partition("\n")
+    return f"{head}\n{line}\n{rest}"

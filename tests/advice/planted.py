@@ -274,7 +274,8 @@ def noise_of_station(rng: np.random.Generator, scene: Scene, data: Data) -> Plan
 
 def unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
     if "azimuth" in data.kind:
-        planted = data.with_unit(data.of("azimuth"), 1.0, np.pi / 180.0)
+        turned = replace(data, z=data.z % (2.0 * np.pi))
+        planted = turned.with_unit(data.of("azimuth"), 1.0, np.pi / 180.0)
         return planted, (), np.pi / 180.0
     meant = [u for u in ("m", "km", "cm", "mm", "ft") if u != data.unit]
     meant += [u for u in (("us", "ns") if data.speed == LIGHT else ("s", "ms")) if u != data.unit]
@@ -284,9 +285,11 @@ def unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
 
 
 def coordinate_unit(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
-    factor = float(rng.choice([1e3, 1e-3, 100.0, 1e-2, 1.0 / 0.3048]))
-    # a stated noise has its own unit, otherwise a change of the values explains the data as well
-    return replace(data, place=data.place * factor, own_sigma=True), (), factor
+    stated, meant = rng.choice([("m", "km"), ("m", "mm"), ("m", "cm"), ("m", "ft"), ("km", "m"), ("cm", "m")])
+    factor = data.size(stated) / data.size(meant)
+    # a noise without a unit of its own would scale with the values, which then explain the data as well
+    planted = replace(data, place=data.place * factor, own_sigma=True, place_unit=str(stated))
+    return planted, (), factor
 
 
 def compass(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:

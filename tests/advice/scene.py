@@ -34,6 +34,7 @@ class Data:
     - own_sigma: whether the noise is stated with its own unit.
     - time (E,): seconds.
     - level: a height that the file states as exact, m.
+    - place_unit: the unit of the coordinates of the stations.
     """
 
     place: Array
@@ -50,6 +51,7 @@ class Data:
     level: float | None = None
     geodetic: Array | None = None
     velocity: Array | None = None
+    place_unit: str = "m"
 
     @property
     def stations(self) -> int:
@@ -129,9 +131,10 @@ def names(data: Data) -> list[str]:
 def text(data: Data) -> str:
     """Return the text of the problem file."""
     lines = ["format = 2"]
-    if data.speed != LIGHT:
+    # times of a second need a statement, because light goes around the Earth in less
+    if data.speed != LIGHT or (data.unit in SECONDS and np.abs(data.z).max() > 1e8):
         lines.append(f"propagation_speed = {data.speed!r}")
-    lines += ["", "[stations]", "rows = ["]
+    lines += ["", "[stations]", *([f'unit = "{data.place_unit}"'] if data.place_unit != "m" else []), "rows = ["]
     lines += [f"  {{ {one} }}," for one in _station_rows(data)] + ["]"]
     if data.geodetic is None and data.place.shape[1] == 3 and np.linalg.norm(data.place[0]) > 6e6:
         lines[1:1] = ["[frame]", 'kind = "ecef"'] if data.speed == LIGHT else []
@@ -147,7 +150,7 @@ def _station_rows(data: Data) -> list[str]:
     keys = "xyz" if data.geodetic is None else ("lat_deg", "lon_deg", "height")
     out = []
     for i, name in enumerate(names(data)):
-        values = data.place[i] if data.geodetic is None else data.geodetic[i]
+        values = data.place[i] / data.size(data.place_unit) if data.geodetic is None else data.geodetic[i]
         pairs = [f'name = "{name}"', *(f"{key} = {float(v)!r}" for key, v in zip(keys, values, strict=False))]
         if data.velocity is not None:
             pairs += [f"v{axis} = {float(v)!r}" for axis, v in zip("xyz", data.velocity[i], strict=False)]

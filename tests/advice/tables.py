@@ -27,7 +27,9 @@ def arguments(data: Data, folder: Path) -> list[str]:
     size = np.pi / 180.0 if kind in _ANGLES else data.size(data.unit)
     geodetic = data.geodetic is not None
     heads = ["lat", "lon", "height"] if geodetic else list("xyz"[: data.place.shape[1]])
-    place = data.geodetic if geodetic else data.place
+    place = data.geodetic if geodetic else data.place / data.size(data.place_unit)
+    if not geodetic and data.place_unit != "m":
+        heads = [f"{axis}_{data.place_unit}" for axis in heads]
     _write(folder / "stations.csv", ["name", *heads], zip(names(data), *place.T.tolist(), strict=True))
     rows = []
     for e, when in enumerate(data.time):
@@ -45,7 +47,7 @@ def arguments(data: Data, folder: Path) -> list[str]:
         out += ["--azimuth", data.azimuth]
     if data.speed != LIGHT and data.unit in SECONDS:
         out += ["--wave-speed", f"{data.speed!r} m/s"]
-    if not geodetic and np.sqrt((place**2).sum(1)).max() > 6e6:
+    if not geodetic and np.sqrt((data.place**2).sum(1)).max() > 6e6:
         out += ["--frame", "ecef"]
     if data.level is not None:
         out += ["--height", f"{data.level!r} m"]
