@@ -306,7 +306,7 @@ def _descend(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array
     for _ in range(_STEPS):
         if not len(active):
             break
-        some = [changes[i] for i in active]
+        some = [changes[int(i)] for i in active]
         system = _system(case, some, theta[active], x[active])
         information, pull, _ = _reduced(case, system, changed(case, some, theta[active]), x[active])
         step = _bounded(some, theta[active], _solve(information, pull) * length[active, None])
@@ -344,7 +344,7 @@ def _assessed(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Arra
     sigma = np.sqrt(np.where(used & (np.diagonal(information, axis1=-2, axis2=-1) > 0.0), variance, np.inf))
     cost = np.where(determined & ~_is_far(case, x), cost, np.inf)
     # a parameter without information changes nothing, so that the change is no explanation
-    open_parameter = np.asarray(used & ~np.isfinite(sigma)).any(-1)
+    open_parameter = np.asarray((used & ~np.isfinite(sigma)).any(-1))
     cost = np.where(open_parameter[:, None], np.inf, cost)
     return Fits(x, np.where(used, theta, 0.0), np.where(used, sigma, 0.0), cost)
 
