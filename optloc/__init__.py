@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import optloc.model_checks
     import optloc.models
     import optloc.multi_target
+    import optloc.partitions
     import optloc.problem
     import optloc.service
     import optloc.show
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     import optloc.station_health
     import optloc.tracking
     import optloc.uncertainty
-    from optloc.advice.advising import advise as advise
     from optloc.advice.diagnosis import diagnose as diagnose
     from optloc.base import units as units
     from optloc.base.errors import InvalidProblem as InvalidProblem, NoSolution as NoSolution
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from optloc.linear import constraints as constraints
     from optloc.linear.simulate import simulate as simulate
     from optloc.multi_target.assign import separate as separate
-    from optloc.partitions.fix_schema import fix_schema as fix_schema
     from optloc.partitions.fix_table import fix_table as fix_table
     from optloc.problem.bias import with_bias as with_bias
     from optloc.problem.build import assemble as assemble, measured as measured, station_array as station_array

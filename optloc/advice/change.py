@@ -86,6 +86,8 @@ class Change:
         Kind of the rows of an error of one station; empty for all kinds.
     base : Problem, optional
         Problems (K,) of another structure, to which the change applies instead.
+    admits : callable, optional
+        Returns whether estimates (q,) are values that the cause can have. By default, all are.
     """
 
     cause: str
@@ -106,6 +108,7 @@ class Change:
     levels: bool = False
     kind: str = ""
     base: Problem | None = None
+    admits: Callable[[Array], bool] | None = None
 
     def in_epochs(self, items: Array) -> Change:
         """Return a change without parameters in some of the epochs."""

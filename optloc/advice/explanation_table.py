@@ -41,6 +41,7 @@ EXPLANATIONS: Registry[PossibleCause] = Registry(
     lambda value: isinstance(value, PossibleCause),
     {
         "offset": PossibleCause("constant error of one station", _USUAL, station_errors.offsets),
+        "outlier": PossibleCause("one wrong row", _USUAL, rows_and_noise.single_outliers),
         "sign-station": PossibleCause("opposite sign of one station", _RARE, station_errors.signs),
         "scale": PossibleCause("wrong scale of one station", _RARE, station_errors.scales),
         "step": PossibleCause("offset of one station from some time on", _RARE, station_errors.steps),
@@ -50,7 +51,6 @@ EXPLANATIONS: Registry[PossibleCause] = Registry(
         "swapped": PossibleCause("two stations are exchanged", _RARE, station_errors.exchanges),
         "reference": PossibleCause("another reference station", _RARE, station_errors.references),
         "moved": PossibleCause("one station is at another position", _RARE, station_errors.moves),
-        "outlier": PossibleCause("one wrong row", _USUAL, rows_and_noise.single_outliers),
         "outliers": PossibleCause("two wrong rows", 2.0 * _USUAL, rows_and_noise.pairs_of_outliers),
         "noise": PossibleCause("larger noise of a kind or station", _USUAL, rows_and_noise.levels),
         "unit": PossibleCause("another unit of the values", _USUAL, readings.units),

@@ -29,6 +29,8 @@ _STEPS = 8
 _DONE = 1e-3
 # Share of the diagonal of an information matrix below which a parameter is undetermined: far above rounding.
 _ROUNDING = 1e-9
+# Number of descents of a search that go to the end, by their cost after a few steps: others end at the same positions.
+_STARTS = 6
 # Distance from the stations, in spreads, beyond which a position is only a direction.
 _FAR = 1e4
 
@@ -155,7 +157,7 @@ def _search(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array)
     """Return the unknowns (E, K, size) of the best positions of a search; `x` are more starts."""
     lanes, flat = changed(case, changes, theta), x.reshape(-1, x.shape[-1])
     if case.base.layout.shares("position") and case.base.layout.n_shared:
-        return fit_anywhere(lanes, flat).x.reshape(x.shape)
+        return fit_anywhere(lanes, flat, _STARTS).x.reshape(x.shape)
     return descend(lanes, flat)[0].reshape(x.shape)
 
 

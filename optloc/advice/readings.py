@@ -30,6 +30,8 @@ _SPEEDS = (SPEED_OF_LIGHT, 343.0, 1500.0)
 _SAME_UNIT = 1e-6
 # Share of a turn by which noise and rounding may exceed it.
 _ROUNDED = 0.01
+# Largest difference between the logarithms of speeds in one medium: air in frost and heat, fresh and salt water.
+_NEAR_SPEED = 0.3
 # Starts of the scale of all lengths: a speed that is wrong by up to a factor of four.
 _SCALES = (-0.75, -0.5, -0.2, 0.0, 0.25, 1.0, 3.0)
 # Starts of the declination, rad: every 45 degrees.
@@ -244,7 +246,14 @@ def speeds(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     column = np.broadcast_to(rows * 1.0, case.present.shape)
     starts = tuple((start,) for start in (*_SCALES, *known))
     kinds = [kind for kind in case.kinds if rows[case.rows_of(kind)].any()]
-    yield Change("speed", partial(_speed_words, case, kinds), columns=(ErrorColumn("scales", column),), starts=starts)
+    words, columns = partial(_speed_words, case, kinds), (ErrorColumn("scales", column),)
+    yield Change("speed", words, columns=columns, starts=starts, admits=_is_speed)
+
+
+def _is_speed(theta: Array) -> bool:
+    """Return whether a scale of all lengths comes from a wrong speed, or from times of both ways instead of one."""
+    ratios = np.array([one / other for one in _SPEEDS for other in _SPEEDS] + [0.5, 2.0])
+    return bool((np.abs(np.log((1.0 + theta[0]) / ratios)) < _NEAR_SPEED).any())
 
 
 def _speed_words(case: MisfitCase, kinds: list[str], theta: Array, sigma: Array) -> Wording:

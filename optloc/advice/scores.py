@@ -82,7 +82,7 @@ def score_of_level(cost: float, dof: int) -> float:
 
 
 def scored(case: MisfitCase, changes: list[Change], fits: Fits, odds: list[float]) -> list[Scored]:
-    """Return the scores of fitted changes; changes that fit no determined position are left out.
+    """Return the scores of fitted changes, without those that fit no determined position or have impossible estimates.
 
     `odds` (E,) are the prices of the causes.
     """
@@ -100,6 +100,8 @@ def scored(case: MisfitCase, changes: list[Change], fits: Fits, odds: list[float
             share = max(float(case.dof.sum()), 1.0) / max(all_rows, 1)
             enlarged = enlarged * share + price_of_level(float(spread.max()), inside * share)
         theta, sigma = fits.theta[e, :q], fits.sigma[e, :q]
+        if change.admits is not None and not change.admits(theta):
+            continue
         price = odds[e] + 2.0 * float(np.log(change.alternatives))
         price += price_of_parameters(theta, sigma) + change.extra * price_of_parameters(np.array([30.0]), np.ones(1))
         out.append(Scored(change, theta, sigma, cost, dof, cost + enlarged + price, fits.x[e]))

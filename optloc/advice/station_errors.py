@@ -171,7 +171,9 @@ def periods(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
         kind = change.kind
         column = change.columns[0].coefficient
         if MODELS[kind].quantity == "length":
-            table = {name: seconds * SPEED_OF_LIGHT for name, seconds in _PERIODS.items()}
+            written = case.base.written
+            speed = written.speed if written is not None and written.speed else SPEED_OF_LIGHT
+            table = {name: seconds * speed for name, seconds in _PERIODS.items()}
         elif kind == "azimuth":
             table = {"half a turn": np.pi}
         else:

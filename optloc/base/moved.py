@@ -13,12 +13,11 @@ from typing import Any
 
 # Names that were attributes of `optloc`, by the package that exports them now.
 _NAMES = {
+    "optloc.advice": "Advice advise",
     "optloc.bounds": "Course Observability crlb_course observability",
     "optloc.engine": "Linear Normal gauss_newton linearise normal predict reduce",
     "optloc.files": "Budget satellites",
-    "optloc.model_checks": (
-        "Advice CommonLevel LateSignals Reliability determined distance_from_plane explained reliability"
-    ),
+    "optloc.model_checks": ("CommonLevel LateSignals Reliability determined distance_from_plane explained reliability"),
     "optloc.models": "Atmosphere Layers MODELS Model",
     "optloc.multi_target": "Emitters",
     "optloc.problem": (

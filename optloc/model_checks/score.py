@@ -453,6 +453,8 @@ def _sigma(problem: Problem, x: Array, part: slice) -> Array:
 _CLOSE = 1e-4
 # Largest number of steps: a search drops diverging descents, and converging descents take a dozen steps.
 _STEPS = 30
+# Steps before descents are compared: the first gives the unknowns that enter linearly, the second a direction.
+_FEW_STEPS = 2
 # Distances of the starts from the centre of the stations in spreads: inside the network, at its edge, and two outside.
 _DISTANCES = (0.4, 1.2, 4.0, 15.0)
 # Distance in spreads of the stations beyond which a position is only a direction: differences of ranges become
@@ -460,13 +462,13 @@ _DISTANCES = (0.4, 1.2, 4.0, 15.0)
 _FLAT = 1e6
 
 
-def descend(problem: Problem, x: Array) -> tuple[Array, Array]:
+def descend(problem: Problem, x: Array, steps: int = _STEPS) -> tuple[Array, Array]:
     """Return least-squares vectors (M, size) from the starts `x` (M, size), and their costs (M,).
 
     `problem` is a flat batch of M problems. The results satisfy equalities; inequalities are ignored. The cost is
-    infinite if a descent fails.
+    infinite if a descent fails. `steps` is the largest number of steps.
     """
-    done = refine(problem, np.array(x), tolerance=_CLOSE, limit=_STEPS, face=exact(problem))
+    done = refine(problem, np.array(x), tolerance=_CLOSE, limit=steps, face=exact(problem))
     return done.x, np.where(np.isfinite(done.cost), done.cost, np.inf)
 
 
@@ -482,12 +484,13 @@ class ScoreFit:
     cost: Array
 
 
-def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
+def fit_anywhere(problem: Problem, more: Array | None = None, most: int | None = None) -> ScoreFit:
     """Return the best fit of N problems of one position, by descents from starts in all directions around the stations.
 
     The result is not proven to be the best fit. The cost is infinite if every descent failed or ended beyond `_FLAT`
     spreads of the stations. If the search misses the best position, an advice is missing, but no advice is wrong.
-    `more` (N, size) is one additional start of each problem; NaN for none.
+    `more` (N, size) is one additional start of each problem; NaN for none. With `most`, only that number of descents
+    goes on after a few steps, those with the least cost.
     """
     n, layout = problem.batch_shape[0], problem.layout
     centre, spread = centre_and_spread(problem.stations.places)
@@ -500,6 +503,12 @@ def fit_anywhere(problem: Problem, more: Array | None = None) -> ScoreFit:
     x[..., slot.start : slot.start + slot.size] = points
     if more is not None:
         x = np.concatenate([x, np.where(np.isfinite(more), more, x[:, 0])[:, None]], axis=1)
+    if most is not None and most < x.shape[1]:
+        many = problem.take(np.repeat(np.arange(n), x.shape[1]))
+        near, before = descend(many, x.reshape(-1, layout.size), _FEW_STEPS)
+        x, before = near.reshape(x.shape), before.reshape(n, -1)
+        cheap = np.argsort(before, axis=1, kind="stable")[:, :most]
+        x = np.take_along_axis(x, cheap[..., None], axis=1)
     # all descents of all problems form one batch
     many = problem.take(np.repeat(np.arange(n), x.shape[1]))
     found, cost = (part.reshape(*x.shape[:2], -1) for part in descend(many, x.reshape(-1, layout.size)))

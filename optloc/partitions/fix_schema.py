@@ -65,7 +65,7 @@ def fix_schema(form: Form = "pandas") -> Any:
     Examples
     --------
     >>> import optloc
-    >>> optloc.fix_schema("spark")[:45]
+    >>> optloc.partitions.fix_schema("spark")[:45]
     'epoch string, time double, target string, sta'
     """
     forms = {"pandas": lambda: frame_of({}, 0), "arrow": _arrow, "spark": _spark}

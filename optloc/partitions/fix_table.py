@@ -65,7 +65,7 @@ def fix_table(
     constraints: Sequence[str] = (),
     **options: Any,
 ) -> pd.DataFrame:
-    """Return the fixes of a table of readings, one row for each event, with the schema `optloc.fix_schema`.
+    """Return the fixes of a table of readings, one row for each event, with the schema `optloc.partitions.fix_schema`.
 
     Each partition of a data set gives a table with the same columns and types, also an empty partition. So Dask, Ray
     Data and Spark can call the function for partitions. All readings of an event must be in one partition.
@@ -151,7 +151,7 @@ def check_shared(hints: ColumnHints) -> None:
 
 
 def fix_rows_labelled(table: Table, source: Path, options: FixOptions) -> tuple[pd.DataFrame, bool]:
-    """Return the fixes of a table of readings, with the schema `optloc.fix_schema`, and whether columns name events.
+    """Return the fixes of a table of readings, in the schema of `fix_schema`, and whether columns name events.
 
     `source` is the name of the table for messages, and `options` are the options of all partitions. Without a column
     of events, each row of a wide table is an event, and its label is the number of the row.

@@ -70,7 +70,7 @@ def answer_of(
     where, details : sequence of (str, str)
         Further rows of these sections.
     advice : sequence of Advice
-        Advice on the data, see `optloc.advise`.
+        Advice on the data, see `optloc.advice.advise`.
     most : int
         Number of rows that tables show completely.
     """

@@ -101,14 +101,14 @@ def test_a_planted_cause_is_named_and_its_lines_mend_the_fix(tmp_path, name):
     problem = read(tmp_path, text)
     fix = optloc.solve(problem, "gtrs+lsr" if problem.epochs == 1 else "auto")
     assert not fix.p_value >= FALSE_ALARM
-    advice = optloc.advise(problem, fix)[0]
+    advice = optloc.advice.advise(problem, fix)[0]
     assert (advice.cause, words in advice.seen) == (cause, True), advice
     assert optloc.solve(read(tmp_path, mended(text, advice)), "auto").p_value >= FALSE_ALARM
 
 
 def test_the_size_of_an_error_is_told_within_its_sigma(tmp_path):
     problem = read(tmp_path, document("tdoa", lambda z: z + at(2, 300.0)))
-    (advice,) = optloc.advise(problem)  # without a fix
+    (advice,) = optloc.advice.advise(problem)  # without a fix
     value, sigma = map(float, re.search(r"of ([-+.\d]+) ± ([.\d]+) m", advice.seen).groups())
     assert abs(value - 300.0) < 4.0 * sigma < 60.0
 
@@ -116,7 +116,7 @@ def test_the_size_of_an_error_is_told_within_its_sigma(tmp_path):
 def test_a_step_in_a_run_is_named_with_its_time(tmp_path):
     late = np.arange(10)[:, None] >= 6
     problem = read(tmp_path, document("tdoa", lambda z: z + late * at(3, 200.0), epochs=10))
-    advice = optloc.advise(problem, optloc.solve(problem))[0]
+    advice = optloc.advice.advise(problem, optloc.solve(problem))[0]
     assert advice.cause == "step"
     assert "station E" in advice.seen
     assert "from t = 60 s on" in advice.seen
@@ -127,7 +127,7 @@ def test_epochs_that_share_nothing_are_looked_at_together(tmp_path):
     problem = read(tmp_path, text)
     fix = optloc.solve(problem)
     assert fix.shape == (8,)
-    advice = optloc.advise(problem, fix)[0]
+    advice = optloc.advice.advise(problem, fix)[0]
     assert advice.cause == "offset"
     assert "station D" in advice.seen
 
@@ -141,7 +141,7 @@ def test_a_boresight_of_azimuth_and_elevation_is_a_turn():
     turned = with_bias(template, "turn", form="rotation", members=[template.stations.names[3]])
     truth = np.concatenate([[4e3, -2e3, 4e3, 80.0, 150.0, 10.0], [0.05, -0.08, 0.02]])
     problem = template.with_rows(z=optloc.simulate(turned, truth=truth, seed=3).z)
-    advice = optloc.advise(problem, optloc.solve(problem))[0]
+    advice = optloc.advice.advise(problem, optloc.solve(problem))[0]
     assert advice.cause == "rotation"
     assert template.stations.names[3] in advice.toml
 
@@ -154,7 +154,7 @@ def test_a_plane_of_stations_is_named_and_a_side_makes_the_fix_unique(tmp_path):
     problem = read(tmp_path, text)
     fix = optloc.solve(problem)
     assert fix.status == optloc.Status.AMBIGUOUS
-    (advice,) = optloc.advise(problem, fix)
+    (advice,) = optloc.advice.advise(problem, fix)
     assert advice.cause == "plane"
     better = optloc.solve(read(tmp_path, mended(text, advice)))
     assert not better.has(optloc.Status.AMBIGUOUS)
@@ -165,33 +165,33 @@ def test_stations_off_their_plane_whose_mirror_image_fits_all_the_same():
     place = np.concatenate([PLACE, 0.01 * HEIGHT[:, None]], axis=1)
     template = optloc.assemble(place, optloc.measured("range", a=np.arange(7), sigma=5.0))
     problem = optloc.simulate(template, truth=[4e3, 3e3, 0.5e3], seed=1)
-    assert [one.cause for one in optloc.advise(problem, optloc.solve(problem))] == ["mirror"]
+    assert [one.cause for one in optloc.advice.advise(problem, optloc.solve(problem))] == ["mirror"]
 
 
 def test_a_line_of_stations_is_named():
     place = np.arange(6)[:, None] * [1e3, 2e3, 0.0]
     template = optloc.assemble(place, optloc.measured("range", a=np.arange(6), sigma=5.0))
     problem = optloc.simulate(template, truth=[4e3, 3e3, 5e3], seed=1)
-    assert [one.cause for one in optloc.advise(problem)] == ["line"]
+    assert [one.cause for one in optloc.advice.advise(problem)] == ["line"]
 
 
 @pytest.mark.parametrize(("count", "word"), [(2, "fewer than unknowns"), (3, "no redundancy"), (4, "redundancy of 1")])
 def test_redundancy_is_counted(count, word):
     template = optloc.assemble(PLACE[:count], optloc.measured("tdoa", a=np.arange(1, count), b=0, sigma=5.0))
-    advice = optloc.advise(optloc.simulate(template, truth=TRUTH, seed=1))
+    advice = optloc.advice.advise(optloc.simulate(template, truth=TRUTH, seed=1))
     assert any(one.cause == "redundancy" and word in one.seen for one in advice)
 
 
 def test_a_file_without_values_has_geometry_alone():
     template = optloc.assemble(PLACE[:4], optloc.measured("tdoa", a=np.arange(1, 4), b=0, sigma=5.0))
-    assert [one.cause for one in optloc.advise(template)] == ["redundancy"]
+    assert [one.cause for one in optloc.advice.advise(template)] == ["redundancy"]
 
 
 def test_a_difference_beyond_the_distance_of_its_stations_is_impossible():
     template = optloc.assemble(PLACE, optloc.measured("tdoa", a=np.arange(1, 7), b=0, sigma=5.0))
     problem = optloc.simulate(template, truth=TRUTH, seed=1)
     wrong = problem.z + at(0, 1.5e4) - at(1, 1.2e4) + at(2, 1.3e4) - at(3, 1.6e4)
-    advice = optloc.advise(problem.with_rows(z=wrong))
+    advice = optloc.advice.advise(problem.with_rows(z=wrong))
     assert advice[0].cause in ("size", "impossible")
 
 
@@ -200,7 +200,7 @@ def test_a_constraint_that_the_data_contradict_is_named():
     bounds = optloc.constraints.box([-np.inf, -np.inf, 200.0], [np.inf, np.inf, 200.0])
     template = optloc.assemble(place, optloc.measured("range", a=np.arange(7), sigma=5.0), constraints=bounds)
     problem = optloc.simulate(template, truth=[4e3, 3e3, 5e3], seed=1)
-    advice = optloc.advise(problem, optloc.solve(problem))
+    advice = optloc.advice.advise(problem, optloc.solve(problem))
     assert advice[0].cause == "height"
     assert "p = 0." in advice[0].seen
 
@@ -233,7 +233,7 @@ def test_a_batch_gets_advice_for_each():
     rows = optloc.measured("range", a=np.arange(7), sigma=5.0)
     problem = optloc.simulate(optloc.assemble(PLACE, rows), truth=np.broadcast_to(TRUTH, (3, 2)), seed=9)
     problem = problem.with_rows(z=problem.z + np.array([0.0, 500.0, 0.0])[:, None] * at(2, 1.0, 7))
-    advice = optloc.advise(problem, optloc.solve(problem))
+    advice = optloc.advice.advise(problem, optloc.solve(problem))
     assert [len(each) for each in advice] == [0, 1, 0]
     assert "S2" in advice[1][0].toml
 
@@ -243,4 +243,4 @@ def test_a_fix_of_another_problem_is_refused():
     problem = optloc.simulate(optloc.assemble(PLACE, rows), truth=TRUTH, seed=9)
     other = optloc.simulate(optloc.assemble(PLACE, rows), truth=np.broadcast_to(TRUTH, (3, 2)), seed=9)
     with pytest.raises(optloc.InvalidProblem, match="fix"):
-        optloc.advise(problem, optloc.solve(other))
+        optloc.advice.advise(problem, optloc.solve(other))

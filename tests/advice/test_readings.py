@@ -3,7 +3,8 @@
 import numpy as np
 from model_checks.small import PLACE, SQUARE, ranges_to
 
-from optloc import advise, assemble, measured, solve
+from optloc import assemble, measured, solve
+from optloc.advice import advise
 
 NOISE = np.array([0.6, -0.4, 0.9, -0.7, 0.2])
 

@@ -1,5 +1,7 @@
 """Values of lower layers are drawn by the table of their folder."""
 
+import sys
+
 import pytest
 
 import optloc
@@ -22,7 +24,8 @@ def test_the_folder_and_the_class_select_the_function(monkeypatch):
 
 
 def test_without_matplotlib_there_is_one_sentence(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.delitem(sys.modules, "optloc.show.pictures.notebook_figure", raising=False)
     problem = optloc.assemble([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], optloc.measured("range", a=[0, 1, 2], sigma=1.0))
     with pytest.raises(optloc.InvalidProblem, match="pip install 'optloc"):
         problem.plot()

@@ -3,7 +3,8 @@
 import pyarrow as pa
 import pytest
 
-from optloc import InvalidProblem, fix_schema
+from optloc import InvalidProblem
+from optloc.partitions import fix_schema
 from optloc.partitions.fix_schema import FIX_COLUMNS, frame_of
 
 

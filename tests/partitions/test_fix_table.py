@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 from partitions.scenes import SIGMA, STATIONS, arrivals, wide
 
-from optloc import InvalidProblem, Stations, fix_schema, fix_table, locate
+from optloc import InvalidProblem, Stations, fix_table, locate
+from optloc.partitions import fix_schema
 
 EVENT = {"message": "event"}
 

@@ -65,4 +65,4 @@ def test_a_prior_has_the_inverse_of_the_covariance():
     line = next(line for line in g2o(results()).splitlines() if line.startswith("EDGE_PRIOR_XY"))
     a, b, c = (float(word) for word in line.split()[-3:])
     assert np.array([[a, b], [b, c]]) == pytest.approx(np.linalg.inv(fix.covariance()), rel=1e-9)
-    assert nmea(results()).startswith("$SNGGA")
+    assert nmea(results()).startswith("$GNGGA")
