@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from optloc.linear import constraints as constraints
     from optloc.linear.simulate import simulate as simulate
     from optloc.multi_target.assign import separate as separate
-    from optloc.partitions.fix_table import fix_table as fix_table
+    from optloc.partitions.one_partition import fix_table as fix_table
     from optloc.problem.bias import with_bias as with_bias
     from optloc.problem.build import assemble as assemble, measured as measured, station_array as station_array
     from optloc.problem.fix import Fix as Fix

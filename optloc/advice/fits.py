@@ -114,6 +114,7 @@ def _relocated(case: MisfitCase, lanes: Problem, changes: Sequence[Change], thet
     return replace(lanes, stations=replace(lanes.stations, position=all_places.reshape(-1, *core)))
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # a scale that becomes zero has no finite cost
 def fit(case: MisfitCase, changes: Sequence[Change]) -> Fits:
     """Return the best fit of each change.
 

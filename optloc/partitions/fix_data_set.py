@@ -22,8 +22,7 @@ from optloc.files.csv_formats import read_table
 from optloc.files.table import Table
 from optloc.partitions.event_index import EventIndex, event_hashes
 from optloc.partitions.executors import TaskExecutor
-from optloc.partitions.fix_schema import fix_schema
-from optloc.partitions.fix_table import FixOptions, check_shared, fix_rows_labelled
+from optloc.partitions.fixed_columns import fix_schema
 from optloc.partitions.journal import (
     FinishedPartition,
     Journal,
@@ -33,6 +32,7 @@ from optloc.partitions.journal import (
     partition_names,
     unwritable_folder,
 )
+from optloc.partitions.one_partition import FixOptions, check_shared, fix_rows_labelled
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from optloc.files.table_import import ColumnHints
 from optloc.partitions import fix_data_set as module
 from optloc.partitions.executors import Died, TaskExecutor
 from optloc.partitions.fix_data_set import fix_data_set
-from optloc.partitions.fix_table import FixOptions
 from optloc.partitions.journal import JOURNAL
+from optloc.partitions.one_partition import FixOptions
 
 HERE = TaskExecutor()
 

@@ -23,7 +23,7 @@ from optloc.files.table import Table, of_arrow
 from optloc.files.table_import import ColumnHints, NoReading, without_ignored_columns
 from optloc.files.wave_speed import WaveOptions
 from optloc.partitions.epoch_fixes import fix_columns, fix_epochs, solve_floors
-from optloc.partitions.fix_schema import frame_of
+from optloc.partitions.fixed_columns import frame_of
 from optloc.problem.epochs import separable
 from optloc.show.columns import Columns
 

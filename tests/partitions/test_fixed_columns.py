@@ -5,7 +5,7 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.partitions import fix_schema
-from optloc.partitions.fix_schema import FIX_COLUMNS, frame_of
+from optloc.partitions.fixed_columns import FIX_COLUMNS, frame_of
 
 
 def test_all_forms_have_the_same_columns():
