@@ -13,6 +13,7 @@ import numpy as np
 
 from optloc.advice.change import Change, MisfitCase
 from optloc.base import linalg
+from optloc.base.frames import Frame
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
@@ -33,6 +34,8 @@ _ROUNDING = 1e-9
 _STARTS = 6
 # Distance from the stations, in spreads, beyond which a position is only a direction.
 _FAR = 1e4
+# Distance from the centre of the Earth below which nothing is located, m: the deepest earthquakes are 700 km deep.
+_DEPTH = 5.6e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,5 +362,19 @@ def _is_far(case: MisfitCase, x: Array) -> Array:
         return np.zeros(x.shape[:2], dtype=bool)
     slot, _ = layout.find("position")
     centre, spread = centre_and_spread(case.base.stations.places)
-    away = np.abs(x[..., slot.start : slot.start + slot.size] - centre).max(-1)
-    return np.asarray(away > _FAR * np.max(spread))
+    position = x[..., slot.start : slot.start + slot.size]
+    far = np.abs(position - centre).max(-1) > _FAR * np.max(spread)
+    return np.asarray(far | _is_behind_earth(case.base.frame, np.reshape(centre, (-1, slot.size))[0], position))
+
+
+def _is_behind_earth(frame: Frame, centre: Array, position: Array) -> Array:
+    """Return flags (E, K) of positions deep in the Earth, or on its other side, which no signal reaches.
+
+    `centre` (d,) is the centre of the stations. Stations all around the Earth have no other side.
+    """
+    if not frame.geodetic:
+        return np.zeros(position.shape[:-1], dtype=bool)
+    middle, place = frame.to_ecef(centre), frame.to_ecef(position)
+    if np.linalg.norm(middle) < _DEPTH:
+        return np.zeros(position.shape[:-1], dtype=bool)
+    return np.asarray((place @ middle < 0.0) | (np.linalg.norm(place, axis=-1) < _DEPTH))

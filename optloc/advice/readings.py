@@ -266,8 +266,9 @@ def _speed_words(case: MisfitCase, kinds: list[str], theta: Array, sigma: Array)
         and written.speed
         and all(_is_time(written.units.get(kind, 1.0), written.speed) for kind in kinds)
     ):
-        speed = float(written.speed * ratio)
-        seen = f"the times fit with a wave speed of {speed:.6g} m/s instead of {written.speed:.6g} m/s"
+        stated = written.speed * (2.0 if written.there_and_back else 1.0)
+        speed = float(f"{stated * ratio:.9g}")
+        seen = f"the times fit with a wave speed of {speed:.6g} m/s instead of {stated:.6g} m/s"
         return Wording(
             seen, "check the speed of the wave", f"propagation_speed = {speed!r}\n", f"--wave-speed '{speed:.9g} m/s'"
         )

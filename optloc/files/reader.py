@@ -162,7 +162,8 @@ class Draft:
         units = {chunk.kind: float(chunk.unit.factor) for chunk in self.chunks}
         speed = self.chunks[0].units.speed if self.chunks else None
         own = any(isinstance(one, str) for each in self.file.measurements for one in (each.sigma, each.arrival_sigma))
-        problem = replace(self.loaded.problem, written=Written(units, speed, own))
+        both = any(each.two_way or each.turn_around is not None for each in self.file.measurements)
+        problem = replace(self.loaded.problem, written=Written(units, speed, both, own))
         more = unused_picks(self.chunks, problem.stations.names)
         return replace(self.loaded, problem=problem, warnings=found + more)
 

@@ -16,10 +16,13 @@ class Written:
         Size of one unit of the values by kind, in SI units; negative if the sign of the values is turned.
     speed : float, optional
         Speed, m/s, by which times are multiplied.
+    there_and_back : bool
+        Whether the times are of both ways, so that the stated speed of the wave is twice `speed`.
     noise_has_unit : bool
         Whether the noise is text with a separate unit, so that it stays if the unit of the values changes.
     """
 
     units: Mapping[str, float] = field(default_factory=dict)
     speed: float | None = None
+    there_and_back: bool = False
     noise_has_unit: bool = False

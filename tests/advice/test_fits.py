@@ -5,8 +5,9 @@ from advice.cases import NAMES, PLACES, at, range_case
 from scipy.optimize import least_squares
 
 from optloc.advice.change import Change, ErrorColumn
-from optloc.advice.fits import fit
+from optloc.advice.fits import _is_behind_earth, fit
 from optloc.advice.wording import no_words
+from optloc.base.frames import Frame
 
 
 def own_cost(problem, count, error):
@@ -48,3 +49,14 @@ def test_a_change_without_information_has_an_infinite_cost():
     case, _ = range_case()
     found = fit(case, [Change("offset", no_words, columns=(ErrorColumn("adds", np.zeros((1, 7))),), starts=((0.0,),))])
     assert not np.isfinite(found.cost).any()
+
+
+def test_no_signal_comes_from_the_other_side_of_the_earth_or_its_centre():
+    frame = Frame("ecef")
+    geodetic = np.array([[47.0, 11.0, 0.0], [-47.0, -169.0, 0.0], [47.0, 11.0, -1e6], [40.0, 60.0, 4e7]])
+    angles = np.radians(geodetic[:, :2])
+    here, antipode, below, above = frame.from_geodetic(angles[:, 0], angles[:, 1], geodetic[:, 2])
+    places = np.array([[here, antipode], [below, above]])
+    assert _is_behind_earth(frame, here, places).tolist() == [[False, True], [True, False]]
+    assert not _is_behind_earth(frame, np.zeros(3), places).any()  # stations all around
+    assert not _is_behind_earth(Frame("cartesian"), here, places).any()

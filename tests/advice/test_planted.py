@@ -56,6 +56,8 @@ SURE = {
     "anticlockwise azimuth": 5001,
     "offset toa sky": 5000,
     "late range": 5001,
+    "outlier azel": 5000,
+    "outlier range_sum": 5001,
 }
 
 

@@ -1,10 +1,12 @@
 """Values that were read in another unit or with another sign are recognised, right ones are not accused."""
 
 import numpy as np
+import pytest
 from model_checks.small import PLACE, SQUARE, ranges_to
 
-from optloc import assemble, measured, solve
+from optloc import assemble, load, measured, solve
 from optloc.advice import advise
+from optloc.advice.readings import _is_speed
 
 NOISE = np.array([0.6, -0.4, 0.9, -0.7, 0.2])
 
@@ -46,3 +48,26 @@ def test_counters_that_count_down_are_recognised():
     assert [one.seen.split(" (p")[0] for one in found] == [
         "the toa values fit with the opposite sign: the counters count down to zero"
     ]
+
+
+def test_a_wrong_speed_of_times_there_and_back_is_named_as_the_file_states_it(tmp_path):
+    places, target = np.array([[0.0, 0.0], [400.0, 0.0], [400.0, 300.0], [0.0, 300.0], [150.0, 500.0]]), (120.0, 90.0)
+    times = 2e3 * np.hypot(*(places - target).T) / 1483.0
+    stations = ", ".join(f'{{ name = "T{i}", x = {x}, y = {y} }}' for i, (x, y) in enumerate(places))
+    rows = ", ".join(f'{{ a = "T{i}", z = {time:.6f} }}' for i, time in enumerate(times))
+    (tmp_path / "pings.toml").write_text(
+        f"format = 2\npropagation_speed = 1500.0\n[stations]\nrows = [{stations}]\n"
+        f'[[measurements]]\nkind = "range"\nunit = "ms"\nsigma = 0.02\ntwo_way = true\nrows = [{rows}]\n'
+    )
+    problem = load(tmp_path / "pings.toml")
+    found = advise(problem, solve(problem))[0]
+    assert found.cause == "speed"
+    assert "instead of 1500 m/s" in found.seen
+    assert float(found.toml.split("=")[1]) == pytest.approx(1483.0, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("factor", "possible"), [(1.0, True), (1.25, True), (0.5, True), (343.0 / 1500.0, True), (1e3, False)]
+)
+def test_a_speed_is_that_of_a_medium(factor, possible):
+    assert _is_speed(np.array([factor - 1.0])) == possible
