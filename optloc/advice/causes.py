@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.advice.change import Change, MisfitCase, Wording
 from optloc.advice.explanation_table import EXPLANATIONS, LATE_PRICE
-from optloc.advice.fits import Fits, fit
+from optloc.advice.fits import Fits, fit, is_out_of_reach
 from optloc.advice.rows_and_noise import late_fit, late_words
 from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
 from optloc.advice.suspects import Suspects
@@ -18,6 +18,7 @@ from optloc.advice.wording import no_words
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
 from optloc.model_checks.cause import Advice
+from optloc.solvers.solution import solve
 
 # Smallest price of any explanation: a misfit of a smaller cost has no cause.
 _CHEAPEST = 2.0
@@ -36,9 +37,11 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     """
     plain = fit(case, [Change("none", no_words)])
     cost, dof = float(plain.cost.sum()), int(case.dof.sum())
+    if cost >= GAP + _CHEAPEST and not np.isfinite(case.x).all():
+        # a direction, or a position that the data determine badly, explains the values without a change
+        cost = min(cost, _solved_cost(case), _cost_at(case, plain.x[0]))
     if not np.isfinite(cost):
-        # a position that the data determine badly, such as one in the plane of the stations, has a cost all the same
-        cost = min(_cost_at(case, case.x), _cost_at(case, plain.x[0]))
+        cost = _cost_at(case, case.x)
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
     case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
@@ -52,9 +55,15 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     return tuple(_distinct(found))[:_LISTED]
 
 
+def _solved_cost(case: MisfitCase) -> float:
+    """Return the cost of a solution of the problem as it is, also at infinity; infinite if it fails."""
+    cost = float(np.sum(solve(case.base).cost))
+    return cost if np.isfinite(cost) else np.inf
+
+
 def _cost_at(case: MisfitCase, x: Array) -> float:
-    """Return the cost at unknowns (K, size); infinite without a value."""
-    if not np.isfinite(x).all():
+    """Return the cost at unknowns (K, size); infinite without a value, and at positions that no signal reaches."""
+    if not np.isfinite(x).all() or is_out_of_reach(case.base, x).any():
         return np.inf
     cost = float(equations_at(case.base, x).cost.sum())
     return cost if np.isfinite(cost) else np.inf

@@ -13,7 +13,6 @@ import numpy as np
 
 from optloc.advice.change import Change, MisfitCase
 from optloc.base import linalg
-from optloc.base.frames import Frame
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
@@ -118,7 +117,7 @@ def _relocated(case: MisfitCase, lanes: Problem, changes: Sequence[Change], thet
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # a scale that becomes zero has no finite cost
-def fit(case: MisfitCase, changes: Sequence[Change]) -> Fits:
+def fit(case: MisfitCase, changes: Sequence[Change], most: int | None = _STARTS) -> Fits:
     """Return the best fit of each change.
 
     A change with parameters and without starts affects a few rows: its fit starts at the fit without these rows.
@@ -129,6 +128,8 @@ def fit(case: MisfitCase, changes: Sequence[Change]) -> Fits:
         The problem.
     changes : sequence of Change
         E changes.
+    most : int, optional
+        Number of descents of a search that go to the end; None for all.
     """
     d = case.base.dimension
     width = max(1, *(change.size(d) for change in changes))
@@ -140,7 +141,7 @@ def fit(case: MisfitCase, changes: Sequence[Change]) -> Fits:
     found = np.stack([case.x if change.x is None else change.x for change in many])
     blind = [i for i, change in enumerate(many) if change.x is None]
     if blind:
-        found[blind] = _search(case, [_without(many[i]) for i in blind], theta[blind], found[blind])
+        found[blind] = _search(case, [_without(many[i]) for i in blind], theta[blind], found[blind], most)
     theta = np.where([[not change.starts] for change in many], _first_values(case, many, theta, found), theta)
     done = _descend(case, many, theta, found)
     total = done.cost.sum(-1)
@@ -157,11 +158,11 @@ def _without(change: Change) -> Change:
     return replace(change, weight=np.where(affected, 0.0, change.weight), columns=(), moved=-1)
 
 
-def _search(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array) -> Array:
+def _search(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array, most: int | None) -> Array:
     """Return the unknowns (E, K, size) of the best positions of a search; `x` are more starts."""
     lanes, flat = changed(case, changes, theta), x.reshape(-1, x.shape[-1])
     if case.base.layout.shares("position") and case.base.layout.n_shared:
-        return fit_anywhere(lanes, flat, _STARTS).x.reshape(x.shape)
+        return fit_anywhere(lanes, flat, most).x.reshape(x.shape)
     return descend(lanes, flat)[0].reshape(x.shape)
 
 
@@ -348,33 +349,43 @@ def _assessed(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Arra
     root, _ = linalg.root(information)
     variance = (root**2).sum(-1)
     sigma = np.sqrt(np.where(used & (np.diagonal(information, axis1=-2, axis2=-1) > 0.0), variance, np.inf))
-    cost = np.where(determined & ~_is_far(case, x), cost, np.inf)
+    cost = np.where(determined & ~_is_far(lanes, x), cost, np.inf)
     # a parameter without information changes nothing, so that the change is no explanation
     open_parameter = np.asarray((used & ~np.isfinite(sigma)).any(-1))
     cost = np.where(open_parameter[:, None], np.inf, cost)
     return Fits(x, np.where(used, theta, 0.0), np.where(used, sigma, 0.0), cost)
 
 
-def _is_far(case: MisfitCase, x: Array) -> Array:
-    """Return flags (E, K) of positions that are so far away that they are only directions."""
-    layout = case.base.layout
-    if not layout.shares("position"):
-        return np.zeros(x.shape[:2], dtype=bool)
-    slot, _ = layout.find("position")
-    centre, spread = centre_and_spread(case.base.stations.places)
-    position = x[..., slot.start : slot.start + slot.size]
-    far = np.abs(position - centre).max(-1) > _FAR * np.max(spread)
-    return np.asarray(far | _is_behind_earth(case.base.frame, np.reshape(centre, (-1, slot.size))[0], position))
+def _is_far(lanes: Problem, x: Array) -> Array:
+    """Return flags (E, K) of positions that are so far away that they are only directions, or that are out of reach.
+
+    `lanes` are the problems (E K,) at whose unknowns `x` (E, K, size) the positions are.
+    """
+    slot = _position_slot(lanes)
+    if slot is None:
+        return np.zeros(x.shape[:-1], dtype=bool)
+    centre, spread = centre_and_spread(lanes.stations.places)
+    away = np.abs(x.reshape(-1, x.shape[-1])[:, slot] - centre).max(-1)
+    return np.asarray((away > _FAR * np.ravel(spread)).reshape(x.shape[:-1]) | is_out_of_reach(lanes, x))
 
 
-def _is_behind_earth(frame: Frame, centre: Array, position: Array) -> Array:
+def is_out_of_reach(lanes: Problem, x: Array) -> Array:
     """Return flags (E, K) of positions deep in the Earth, or on its other side, which no signal reaches.
 
-    `centre` (d,) is the centre of the stations. Stations all around the Earth have no other side.
+    The arguments are as in `_is_far`. Stations all around the Earth have no other side.
     """
-    if not frame.geodetic:
-        return np.zeros(position.shape[:-1], dtype=bool)
-    middle, place = frame.to_ecef(centre), frame.to_ecef(position)
-    if np.linalg.norm(middle) < _DEPTH:
-        return np.zeros(position.shape[:-1], dtype=bool)
-    return np.asarray((place @ middle < 0.0) | (np.linalg.norm(place, axis=-1) < _DEPTH))
+    slot = _position_slot(lanes)
+    if slot is None or not lanes.frame.geodetic:
+        return np.zeros(x.shape[:-1], dtype=bool)
+    centre, _ = centre_and_spread(lanes.stations.places)
+    middle, place = lanes.frame.to_ecef(centre), lanes.frame.to_ecef(x.reshape(-1, x.shape[-1])[:, slot])
+    hidden = ((place * middle).sum(-1) < 0.0) | (np.linalg.norm(place, axis=-1) < _DEPTH)
+    return np.asarray((hidden & (np.linalg.norm(middle, axis=-1) > _DEPTH)).reshape(x.shape[:-1]))
+
+
+def _position_slot(problem: Problem) -> slice | None:
+    """Return the slice of the position in the unknowns; None if the rows share no position."""
+    if not problem.layout.shares("position"):
+        return None
+    slot, _ = problem.layout.find("position")
+    return slice(slot.start, slot.start + slot.size)

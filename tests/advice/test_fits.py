@@ -4,10 +4,10 @@ import numpy as np
 from advice.cases import NAMES, PLACES, at, range_case
 from scipy.optimize import least_squares
 
+import optloc
 from optloc.advice.change import Change, ErrorColumn
-from optloc.advice.fits import _is_behind_earth, fit
+from optloc.advice.fits import fit, is_out_of_reach
 from optloc.advice.wording import no_words
-from optloc.base.frames import Frame
 
 
 def own_cost(problem, count, error):
@@ -52,11 +52,13 @@ def test_a_change_without_information_has_an_infinite_cost():
 
 
 def test_no_signal_comes_from_the_other_side_of_the_earth_or_its_centre():
-    frame = Frame("ecef")
+    frame = optloc.Frame("ecef")
     geodetic = np.array([[47.0, 11.0, 0.0], [-47.0, -169.0, 0.0], [47.0, 11.0, -1e6], [40.0, 60.0, 4e7]])
     angles = np.radians(geodetic[:, :2])
-    here, antipode, below, above = frame.from_geodetic(angles[:, 0], angles[:, 1], geodetic[:, 2])
-    places = np.array([[here, antipode], [below, above]])
-    assert _is_behind_earth(frame, here, places).tolist() == [[False, True], [True, False]]
-    assert not _is_behind_earth(frame, np.zeros(3), places).any()  # stations all around
-    assert not _is_behind_earth(Frame("cartesian"), here, places).any()
+    targets = frame.from_geodetic(angles[:, 0], angles[:, 1], geodetic[:, 2])
+    network = targets[0] + 1e4 * np.eye(3)
+    around = 7e6 * np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    for stations, hidden in ((network, [False, True, True, False]), (around, [False] * 4)):
+        rows = optloc.measured("range", a=np.arange(len(stations)), sigma=1.0)
+        problem = optloc.assemble(stations, rows, frame=frame).flat()
+        assert is_out_of_reach(problem.take(np.zeros(4, dtype=int)), targets[:, None]).ravel().tolist() == hidden

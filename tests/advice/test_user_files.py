@@ -64,8 +64,10 @@ def test_counters_that_count_up_have_no_cause(tmp_path):
     assert causes(advise(problem, optloc.solve(problem))) == []
 
 
-def test_bearings_of_a_drive_on_earth_are_turned(tmp_path):
-    assert drive(tmp_path, "anticlockwise", ("lat", "lon"), ROAD, BEARINGS)[:1] == ["anticlockwise"]
+@pytest.mark.parametrize("cause", TURNED)
+def test_bearings_of_a_drive_on_earth_are_turned(cause, tmp_path):
+    """Half a turn leads to the other side of the Earth, which no signal reaches."""
+    assert drive(tmp_path, cause, ("lat", "lon"), ROAD, BEARINGS) == [cause]
 
 
 @pytest.mark.parametrize("cause", TURNED)
@@ -79,3 +81,15 @@ def test_a_square_of_receivers_is_no_line(sigma):
     problem = optloc.assemble(square, optloc.measured("tdoa", a=[1, 2, 3], b=0, arrival_sigma=sigma))
     problem = optloc.simulate(problem, np.array([3.0, 5.0]), 1)
     assert {one.cause for one in advise(problem, optloc.solve(problem))} & {"line", "plane", "mirror"} == set()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 16, 37])
+def test_a_far_target_has_no_cause(seed):
+    """Differences of ranges give a direction; with the opposite sign the same values would give a position."""
+    rng = np.random.default_rng([7, seed])
+    stations = rng.uniform(-1e3, 1e3, (6, 3))
+    target = rng.normal(size=3)
+    target *= rng.uniform(2e4, 2e6) / np.sqrt((target**2).sum())
+    rows = optloc.measured("tdoa", a=np.arange(1, 6), b=[0] * 5, arrival_sigma=3.0)
+    problem = optloc.simulate(optloc.assemble(stations, rows), truth=target, seed=seed)
+    assert causes(advise(problem, optloc.solve(problem))) == []
