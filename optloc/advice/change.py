@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from optloc.base.cached import cached_property
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, FormName
 from optloc.models import MODELS

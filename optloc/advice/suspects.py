@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
 from optloc.advice.change import Change, ErrorColumn, MisfitCase
 from optloc.advice.fits import Fits, fit
 from optloc.advice.wording import station_words
+from optloc.base.cached import cached_property
 from optloc.base.types import Array
 
 
