@@ -14,12 +14,13 @@ from optloc.problem.problem import Problem
 # Largest number of separate epochs that are compared, the worst of them among them: an error of all rows or of a
 # station is visible in a few epochs.
 _EPOCHS, _WORST = 12, 3
-# Largest number of rows of a run with shared unknowns: its Jacobian is dense here.
-_ROWS = 400
+# Largest numbers of rows and of unknowns of a run with shared unknowns. Its equations are dense here, and thousands of
+# fits are solved together: with 60 unknowns they need some hundred megabytes.
+_ROWS, _UNKNOWNS = 400, 60
 
 
 def case_of(problem: Problem, x: Array) -> MisfitCase | None:
-    """Return the case of a problem; None if no epoch has redundancy.
+    """Return the case of a problem; None if no epoch has redundancy, or a run cannot be sampled.
 
     Parameters
     ----------
@@ -31,6 +32,8 @@ def case_of(problem: Problem, x: Array) -> MisfitCase | None:
     origin = problem.origin if np.isfinite(problem.times).all() else 0.0
     if not separable(problem):
         part, start = _shortened(problem, x)
+        if part.layout.size > _UNKNOWNS:
+            return None
         dof = np.atleast_1d(spare_rows(part))
         if dof[0] < 1:
             return None
@@ -77,13 +80,17 @@ def _kept_epochs(problem: Problem, part: Problem) -> Array:
 
 
 def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return a run with at most about `_ROWS` rows, in epochs spread evenly over the run, and its vector."""
-    if problem.count <= _ROWS or problem.epochs == 1 or has_correlated_epochs(problem):
+    """Return a run within the limits of rows and unknowns, in epochs spread evenly over the run, and its vector.
+
+    A run whose epochs are correlated stays whole.
+    """
+    n, length = problem.layout.n_shared, problem.layout.n_local
+    most = min(problem.epochs * _ROWS / problem.count, (_UNKNOWNS - n) / max(length, 1))
+    if most >= problem.epochs or problem.epochs == 1 or has_correlated_epochs(problem):
         return problem, x
-    kept = max(2, int(problem.epochs * _ROWS / problem.count))
+    kept = max(2, int(most))
     chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
     # epochs without rows determine nothing
     chosen = chosen[np.isin(chosen, problem.epoch)]
-    n, length = problem.layout.n_shared, problem.layout.n_local
     local = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
     return some_epochs(problem, chosen), np.concatenate([x[:, :n], local.reshape(len(x), -1)], axis=1)

@@ -16,6 +16,7 @@ from optloc.base.types import Array, CompassRows
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
 from optloc.problem.bias import family
+from optloc.problem.forms import FORMS
 
 # Stations whose other errors are tried: the best few without whose rows the cost is least.
 _TRIED = 5
@@ -116,10 +117,10 @@ def _rotation_words(case: MisfitCase, name: str, theta: Array, sigma: Array) -> 
 
 def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
     for station, kind in suspects.first(_TRIED):
-        if form == "scale" and MODELS[kind].period is not None:
+        if FORMS[form].enters == "scales" and MODELS[kind].period is not None:
             continue
         own = case.coefficients("station", form, kind, case.names[station])  # type: ignore[arg-type]
-        column = own * (case.when if form == "drift" else np.ones_like(case.when))
+        column = own * (case.when if FORMS[form].rate else np.ones_like(case.when))
         words = partial(station_words, case, form, kind, case.names[station])
         yield Change(
             form,

@@ -10,6 +10,7 @@ from optloc.advice.change import MisfitCase, Wording
 from optloc.base.types import Array
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS
+from optloc.problem.forms import FORMS
 
 
 def quoted(text: str) -> str:
@@ -53,11 +54,11 @@ def row_name(case: MisfitCase, epoch: int, row: int) -> str:
 
 def station_words(case: MisfitCase, form: str, kind: str, name: str, theta: Array, sigma: Array) -> Wording:
     """Return the text about an offset, scale or drift of one station."""
-    unit = {"scale": "", "drift": f"{unit_of(kind)}/s"}.get(form, unit_of(kind))
+    of_form = FORMS[form]
+    unit = "" if of_form.enters == "scales" else f"{unit_of(kind)}/s" if of_form.rate else unit_of(kind)
     size = size_text(theta[0], sigma[0], unit)
     rows = f" in its {kind} rows" if len(case.kinds) > 1 else ""
-    article = "an" if form == "offset" else "a"
-    seen = f"{article} {form} of station {name}{rows} of {size} would explain the misfit"
+    seen = f"{of_form.noun} of station {name}{rows} of {size} would explain the misfit"
     return Wording(
         seen, "check this channel; until then, model the error", bias_lines(case, form, "station", kind, (name,))
     )

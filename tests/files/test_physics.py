@@ -65,10 +65,10 @@ def test_json_has_the_warnings_and_advice_does_not_repeat_them(folder):
     assert "size" not in [one["cause"] for one in answer["advice"]]
 
 
-def test_advice_in_python_has_the_same_sentence(folder):
+def test_advice_in_python_names_the_unit(folder):
     write(folder, 1e-3)
     problem = read(site(folder)).problem
-    assert "size" in [one.cause for one in optloc.diagnose(problem, optloc.solve(problem)).advice]
+    assert "unit" in [one.cause for one in optloc.diagnose(problem, optloc.solve(problem)).advice]
 
 
 def test_negative_ranges_are_refused_with_row_or_station(folder):

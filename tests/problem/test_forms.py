@@ -21,6 +21,8 @@ from optloc.tracking.dynamics import polynomial
 
 ROOT = Path(__file__).resolve().parents[2]
 OWNER = ROOT / "optloc/problem/forms.py"
+# Its keys are causes of a misfit, and some causes have the name of a form.
+CAUSES = ROOT / "optloc/advice/explanation_table.py"
 
 
 def test_type_checkers_know_the_forms_of_the_table():
@@ -80,7 +82,7 @@ def test_a_comparison_is_found(source):
 
 
 def test_no_other_file_compares_the_names_of_forms():
-    files = [path for path in (ROOT / "optloc").rglob("*.py") if path != OWNER and mentions(path)]
+    files = [path for path in (ROOT / "optloc").rglob("*.py") if path not in (OWNER, CAUSES) and mentions(path)]
     found = [f"{path.relative_to(ROOT)}:{line}" for path in files for line in decisions(nodes(path))]
     assert not found
 
