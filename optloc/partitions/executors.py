@@ -5,9 +5,10 @@ Results come in the order of their completion. A cluster runs few tasks ahead, s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from time import monotonic
 from typing import Any, TypeVar
 
 from optloc.base.errors import InvalidProblem, nearest
@@ -21,6 +22,8 @@ Result = TypeVar("Result")
 _AHEAD = 2
 # A worker that ends three times at one task, for example without memory, fails the task.
 _DEATHS = 3
+# Seconds between looks at the workers, and the longest time without any worker: a new one starts in some seconds.
+_LOOK, _WITHOUT_WORKERS = 5.0, 60.0
 _ENDED = "the workers of this partition ended again and again"
 
 
@@ -90,36 +93,55 @@ def run_on_one_thread(work: Callable[[Task], Result], task: Task) -> Result:
 def _run_on_dask(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
     """Yield the results of tasks on a Dask cluster, which starts tasks of lost workers again."""
     with dask_client(by.address, by.jobs or thread_count()) as client:
-        from distributed import KilledWorker, as_completed
+        from distributed import KilledWorker
 
-        waiting, running, completed = iter(tasks), dict[Any, Task](), as_completed()
-        suspects = list[Task]()
+        waiting, running, suspects = iter(tasks), dict[Any, Task](), list[Task]()
 
         def submit(task: Task) -> Any:
             # A task is never the same as an earlier one: the input file may have changed.
             return client.submit(run_on_one_thread, work, task, pure=False)
 
         def hand_out(count: int) -> None:
-            for task in islice(waiting, count):
-                future = submit(task)
-                running[future] = task
-                completed.add(future)
+            running.update((submit(task), task) for task in islice(waiting, count))
 
         hand_out(_AHEAD * sum(client.ncores().values()))
-        for future in completed:
-            task = running.pop(future)
-            hand_out(1)
-            try:
-                yield task, future.result()
-            except KilledWorker:
-                suspects.append(task)
-            future.release()
+        while running:
+            for future in _finished(client, running, by.address):
+                task = running.pop(future)
+                hand_out(1)
+                try:
+                    yield task, future.result()
+                except KilledWorker:
+                    suspects.append(task)
+                future.release()
         # Dask also blames the tasks that waited at a lost worker, so each suspect is tried again alone.
         for task in suspects:
             try:
-                yield task, submit(task).result()
+                yield task, _finished(client, [submit(task)], by.address)[0].result()
             except KilledWorker:
                 yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
+
+
+def _finished(client: Any, futures: Iterable[Any], address: str | None) -> list[Any]:
+    """Return the futures that have finished, as soon as there is one.
+
+    Raises
+    ------
+    InvalidProblem
+        If the cluster has no worker for `_WITHOUT_WORKERS` seconds: Dask would wait without end.
+    """
+    from distributed import wait
+
+    wanted, end = list(futures), monotonic() + _WITHOUT_WORKERS
+    while True:
+        try:
+            return list(wait(wanted, timeout=_LOOK, return_when="FIRST_COMPLETED").done)
+        except TimeoutError:
+            if client.ncores():
+                end = monotonic() + _WITHOUT_WORKERS
+            elif monotonic() > end:
+                advice = "start workers, and run the same command: finished parts are kept"
+                raise InvalidProblem("all workers have ended", address or "dask", advice) from None
 
 
 def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:

@@ -1,6 +1,7 @@
 """Executors: the same results everywhere; lost workers are survived, and a dead scheduler is one sentence."""
 
 import importlib.util
+import logging
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.base.threads import thread_count
+from optloc.partitions import executors
 from optloc.partitions.executors import TASK_EXECUTORS, Died, TaskExecutor, task_executor
 
 FEW = range(5)
@@ -106,4 +108,18 @@ def test_a_scheduler_that_ends_is_one_sentence(tmp_path):
         assert next(results) == (0, 0)
         os.killpg(cluster.pid, signal.SIGKILL)
         with pytest.raises(InvalidProblem, match="the scheduler has ended; start it again"):
+            list(results)
+
+
+@pytest.mark.slow
+def test_a_cluster_whose_workers_have_ended_is_one_sentence(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(executors, "_LOOK", 0.2)
+    monkeypatch.setattr(executors, "_WITHOUT_WORKERS", 1.0)
+    options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+    with distributed.LocalCluster(n_workers=1, **options) as cluster:
+        results = TaskExecutor("dask", address=cluster.scheduler_address).run(slowly, range(100))
+        assert next(results) == (0, 0)
+        cluster.scale(0)
+        with pytest.raises(InvalidProblem, match="all workers have ended; start workers"):
             list(results)
