@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +17,14 @@ from optloc.partitions import executors
 from optloc.partitions.executors import TASK_EXECUTORS, Died, TaskExecutor, task_executor
 
 FEW = range(5)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def importable(monkeypatch):
+    """Let workers import the functions of this module; they get the path of this process, or the environment."""
+    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT)])
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
 def square(number):
@@ -74,7 +83,7 @@ def test_ray_gives_the_same_results():
 
 
 @pytest.mark.slow
-def test_dask_gives_the_same_results_survives_a_lost_worker_and_reports_a_fatal_task(tmp_path):
+def test_dask_gives_the_same_results_survives_a_lost_worker_and_reports_a_fatal_task(tmp_path, importable):
     pytest.importorskip("distributed")
     by = TaskExecutor("dask", 2)
     assert sorted(by.run(square, FEW)) == [(i, i * i) for i in FEW]
@@ -97,7 +106,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_ends_is_one_sentence(tmp_path):
+def test_a_scheduler_that_ends_is_one_sentence(tmp_path, importable):
     pytest.importorskip("distributed")
     (tmp_path / "cluster.py").write_text(SCHEDULER)
     with subprocess.Popen(
@@ -112,7 +121,7 @@ def test_a_scheduler_that_ends_is_one_sentence(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_whose_workers_have_ended_is_one_sentence(monkeypatch):
+def test_a_cluster_whose_workers_have_ended_is_one_sentence(monkeypatch, importable):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(executors, "_LOOK", 0.2)
     monkeypatch.setattr(executors, "_WITHOUT_WORKERS", 1.0)
