@@ -38,8 +38,8 @@ finally:
 # one for columns of words in tables; one for the lines of sight that the Earth may block; two for mirror images in the
 # plane of the stations, and whether both sides of it are alike; two for laws that bounds cut off; six for constraints,
 # fences and their checks, once one module; six for waves, their speeds, phases and physical checks of tables; one for
-# the horizon, once a part of the inequalities; one for the time of emission; four for properties and locks that survive a
-# fork, the fixes of epochs that data sets share, and the answer of a row.
+# the horizon, once a part of the inequalities; one for the time of emission; four for properties and locks that survive
+# a fork, the fixes of epochs that data sets share, and the answer of a row.
 MOST = 104
 
 
