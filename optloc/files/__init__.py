@@ -14,12 +14,12 @@ if TYPE_CHECKING:
         read_text as read_text,
         within as within,
     )
+    from optloc.base.locked_folder import locked_folder as locked_folder, unwritable_folder as unwritable_folder
     from optloc.base.outputs import (
         GrowingFile as GrowingFile,
         claim as claim,
         is_stream as is_stream,
         make_folder as make_folder,
-        refuse_address as refuse_address,
         replace_together as replace_together,
         visible as visible,
         write_text as write_text,

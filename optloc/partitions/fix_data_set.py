@@ -16,6 +16,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import Budget, access
+from optloc.base.locked_folder import unwritable_folder
 from optloc.base.registry import load_plugin, plugins
 from optloc.base.types import Array
 from optloc.files.csv_formats import read_table
@@ -24,13 +25,13 @@ from optloc.partitions.event_index import EventIndex, event_hashes
 from optloc.partitions.executors import TaskExecutor
 from optloc.partitions.fixed_columns import fix_schema
 from optloc.partitions.journal import (
+    KEPT,
     FinishedPartition,
     Journal,
     digest_of,
     folder_keys,
     locked_output,
     partition_names,
-    unwritable_folder,
 )
 from optloc.partitions.one_partition import FixOptions, check_shared, fix_rows_labelled
 
@@ -187,7 +188,7 @@ def _write(path: Path, frame: Any) -> str:
         scratch.replace(path)
     except OSError as error:
         scratch.unlink(missing_ok=True)
-        raise unwritable_folder(path.parent, error) from None
+        raise unwritable_folder(path.parent, error, KEPT) from None
     return digest
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import read_bytes
+from optloc.base.locked_folder import locked_folder, unwritable_folder
 from optloc.base.outputs import refuse_address
 
 JOURNAL = "_optloc.jsonl"
@@ -23,7 +24,8 @@ JOURNAL = "_optloc.jsonl"
 _LOCK, _ENDINGS = "_optloc.lock", (".parquet", ".pq")
 # The format of the journal; folders with another format are refused.
 _FORMAT = 1
-_KEPT = "finished partitions are kept, and the same command continues"
+KEPT = "finished partitions are kept, and the same command continues"
+"""Next step if the folder of the fixes cannot be written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,29 +99,8 @@ def locked_output(folder: Path, data_set: Path) -> Iterator[None]:
     here, there = folder.resolve(), data_set.resolve()
     if here.is_relative_to(there) or there.is_relative_to(here):
         raise InvalidProblem("the fixes would be inside the data set", str(folder), "name another folder after --out")
-    try:
-        names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if names and not names & {JOURNAL, _LOCK}:
-            raise InvalidProblem("the folder has other files", str(folder), "name another folder after --out")
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / _LOCK).open("ab")
-    except OSError as error:
-        raise unwritable_folder(folder, error) from None
-    with file:
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InvalidProblem("another run writes to this folder", str(folder), "wait until it ends") from None
-        except (ImportError, OSError):  # a system or a file system without locks
-            pass
+    with locked_folder(folder, _LOCK, JOURNAL, "the folder has other files", KEPT):
         yield
-
-
-def unwritable_folder(folder: Path, error: OSError) -> InvalidProblem:
-    """Return the error for a folder that cannot be written, with the reason of the system."""
-    return InvalidProblem(f"the folder cannot be written ({error.strerror or error})", str(folder), _KEPT)
 
 
 class Journal:
@@ -152,7 +133,7 @@ class Journal:
             for scratch in folder.rglob(".optloc-*"):
                 scratch.unlink(missing_ok=True)
         except OSError as error:
-            raise unwritable_folder(folder, error) from None
+            raise unwritable_folder(folder, error, KEPT) from None
         if not complete:
             self._append(header)
             return
@@ -181,7 +162,7 @@ class Journal:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise unwritable_folder(self.path.parent, error) from None
+            raise unwritable_folder(self.path.parent, error, KEPT) from None
 
     def is_done(self, name: str, data_set: Path) -> bool:
         """Return whether a partition is finished: its readings and its fixes have the checksums of the journal."""

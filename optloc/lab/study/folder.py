@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.files import json_of, read_bytes, refuse_address, within, written
+from optloc.files import json_of, locked_folder, read_bytes, unwritable_folder, within, written
 from optloc.lab.study.baselines import BASELINES
 from optloc.lab.study.design import StudyDesign, machine, versions
 from optloc.lab.study.methods import version_of
@@ -185,7 +185,7 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
         (folder / "parts").mkdir(parents=True, exist_ok=True)
         _clean(folder)
     except OSError as error:
-        raise _unwritable(folder, error) from None
+        raise unwritable_folder(folder, error, _ADVICE) from None
     if manifest != before:
         data = {"format": FORMAT, **{name: getattr(manifest, name) for name in StudyManifest.__slots__}}
         content = json.dumps(data, indent=1).encode()
@@ -197,11 +197,6 @@ def begin(design: StudyDesign, folder: Path) -> StudyManifest:
 
 
 _ADVICE = "free space or choose another folder; finished parts are kept, and the same command continues"
-
-
-def _unwritable(path: Path, error: OSError) -> InvalidProblem:
-    """Return the error for a file or folder that cannot be written, with the reason of the system."""
-    return InvalidProblem(f"the folder cannot be written ({error.strerror or error})", str(path), _ADVICE)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -223,7 +218,7 @@ def _renew(path: Path, content: bytes) -> None:
     try:
         scratch.replace(path)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise unwritable_folder(path, error, _ADVICE) from None
 
 
 def _clean(folder: Path) -> None:
@@ -307,7 +302,7 @@ def finished_parts(folder: Path, manifest: StudyManifest, say: Callable[[str], N
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
-                raise _unwritable(path, error) from None
+                raise unwritable_folder(path, error, _ADVICE) from None
     return done
 
 
@@ -373,26 +368,7 @@ def locked(folder: Path) -> Iterator[None]:
     InvalidProblem
         If another run has the lock, the folder cannot be written, or it contains other files than a study.
     """
-    refuse_address(folder)
-    try:
-        # Leave a folder with other files unchanged.
-        if folder.is_dir() and not {MANIFEST, _LOCK} & (names := {path.name for path in folder.iterdir()}) and names:
-            advice = "choose another with --out"
-            raise InvalidProblem("the folder is not empty, and contains no study", str(folder), advice)
-        folder.mkdir(parents=True, exist_ok=True)
-        # Open for writing: network file systems do not lock other files.
-        file = (folder / _LOCK).open("ab")
-    except OSError as error:
-        raise _unwritable(folder, error) from None
-    with file:
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InvalidProblem("another run writes to this folder", str(folder), "wait until it ends") from None
-        except (ImportError, OSError):  # a system or a file system without locks
-            pass
+    with locked_folder(folder, _LOCK, MANIFEST, "the folder is not empty, and contains no study", _ADVICE):
         yield
 
 
