@@ -5,34 +5,32 @@ import pytest
 from optloc.base.errors import InvalidProblem
 from optloc.base.locked_folder import locked_folder
 
-WORDS = ("other files", "try again")
+
+def write_once(folder):
+    """Lock a folder as a run does, and end."""
+    with locked_folder(folder, ".lock", "list.json", "other files", "try again"):
+        assert folder.is_dir()
 
 
 def test_a_second_run_waits_until_the_first_has_ended(tmp_path):
     folder = tmp_path / "new" / "results"
-    with locked_folder(folder, ".lock", "list.json", *WORDS):
-        with pytest.raises(InvalidProblem, match="another run writes to this folder; wait until it ends"):
-            with locked_folder(folder, ".lock", "list.json", *WORDS):
-                pass
-    with locked_folder(folder, ".lock", "list.json", *WORDS):
-        assert folder.is_dir()
+    with locked_folder(folder, ".lock", "list.json", "other files", "try again"):
+        pytest.raises(InvalidProblem, write_once, folder).match("another run writes to this folder; wait until it ends")
+    write_once(folder)
 
 
-@pytest.mark.parametrize(("name", "refused"), [("letter.txt", True), ("list.json", False), (".lock", False)])
-def test_a_folder_of_others_stays_as_it_is(tmp_path, name, refused):
+def test_a_folder_of_others_stays_as_it_is(tmp_path):
+    (tmp_path / "letter.txt").touch()
+    pytest.raises(InvalidProblem, write_once, tmp_path).match("other files; choose another with --out")
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize("name", ["list.json", ".lock"])
+def test_a_folder_of_an_earlier_run_is_taken(tmp_path, name):
     (tmp_path / name).touch()
-    if refused:
-        with pytest.raises(InvalidProblem, match="other files; choose another with --out"):
-            with locked_folder(tmp_path, ".lock", "list.json", *WORDS):
-                pass
-        assert [path.name for path in tmp_path.iterdir()] == [name]
-    else:
-        with locked_folder(tmp_path, ".lock", "list.json", *WORDS):
-            pass
+    write_once(tmp_path)
 
 
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(InvalidProblem, match=r"the folder cannot be written .*; try again"):
-        with locked_folder(tmp_path / "file" / "inner", ".lock", "list.json", *WORDS):
-            pass
+    pytest.raises(InvalidProblem, write_once, tmp_path / "file" / "inner").match("the folder cannot be written .*; try")
