@@ -196,14 +196,14 @@ def _senses(case: MisfitCase) -> Iterator[Change]:
     if compass:
         # the reading r was taken as pi/2 - r
         yield _sense(rows, "compass", -1.0, half, "as angles from east, counter-clockwise", east)
-        yield _sense(rows, "anticlockwise", -1.0, np.pi, "counter-clockwise from north", north)
+        yield _sense(rows, "anticlockwise", -1.0, np.pi, "as angles from north, counter-clockwise", north)
     else:
         yield _sense(rows, "compass", -1.0, half, "as compass bearings", 'azimuth = "north-clockwise"\n')
-        yield _sense(rows, "anticlockwise", 1.0, half, "counter-clockwise from north", north)
+        yield _sense(rows, "anticlockwise", 1.0, half, "as angles from north, counter-clockwise", north)
         degrees = 'unit = "deg"\nazimuth = "north-clockwise"\n'
         for spread in (1.0, 180.0 / np.pi):
             yield _sense(rows, "compass", -np.pi / 180.0, half, "as compass bearings in degrees", degrees, spread)
-    turned = "from the target to the station, half a turn more"
+    turned = "if each is turned by half a turn: they point from the target to the station"
     yield _sense(rows, "opposite", 1.0, np.pi, turned, 'correction = "180 deg"\n')
 
 
@@ -219,7 +219,7 @@ def _sense(rows: Array, cause: str, factor: float, shift: float, how: str, toml:
 
 
 def _sense_words(how: str, toml: str, theta: Array, sigma: Array) -> Wording:
-    return Wording(f"the azimuths do not intersect as read, but they do {how}", "state the convention", toml)
+    return Wording(f"the azimuths do not fit as read, but they fit {how}", "state the convention", toml)
 
 
 def declinations(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:

@@ -180,5 +180,5 @@ def late_words(fit: LateFit, theta: Array, sigma: Array) -> Wording:
     seen = (
         f"late signals would explain the misfit: {fit.share:.0%} of the rows, late by {fit.delay:.3g} sigma on average"
     )
-    advice = "use a loss for late rows, or remove the receivers without a line of sight"
+    advice = "use a robust loss for late rows, or remove the receivers without a line of sight"
     return Wording(seen, advice, "", "--late-from-data")

@@ -87,7 +87,8 @@ def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
 
 def _step_words(case: MisfitCase, kind: str, name: str, cut: float, theta: Array, sigma: Array) -> Wording:
     size = size_text(theta[0], sigma[0], unit_of(kind))
-    seen = f"a step of station {name} of {size} from t = {case.origin + cut:.6g} s on would explain the misfit"
+    when = f"from t = {case.origin + cut:.6g} s on"
+    seen = f"an offset of station {name} of {size}, {when}, would explain the misfit"
     return Wording(seen, "split the run there, or give the later rows another station name")
 
 
@@ -267,5 +268,6 @@ def moves(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
 def _move_words(case: MisfitCase, station: int, theta: Array, sigma: Array) -> Wording:
     place = case.base.stations.position.reshape(-1, case.base.dimension)[station] + theta
     text = ", ".join(f"{v:.6g}" for v in place)
-    seen = f"station {case.names[station]} would fit {np.linalg.norm(theta):.4g} m away from its stated position"
-    return Wording(seen, f"check its coordinates; the data fit ({text}) m in the axes of the problem")
+    away = f"{np.linalg.norm(theta):.4g} m away from its stated position"
+    seen = f"the values fit if station {case.names[station]} is {away}"
+    return Wording(seen, f"check its coordinates; the values give ({text}) m, in the axes of the problem")
