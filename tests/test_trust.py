@@ -3,6 +3,7 @@
 import copy
 import os
 import sys
+import threading
 import types
 import typing
 from contextlib import contextmanager, suppress
@@ -57,14 +58,17 @@ FORBIDDEN = (
 
 
 class Watch:
-    """What Python's audit events say while it looks; hooks cannot be removed, so there is one."""
+    """What Python's audit events say while it looks; hooks cannot be removed, so there is one.
+
+    Threads that run before it looks belong to libraries or to other tests. Only this thread and new ones are watched.
+    """
 
     def __init__(self):
-        self.looking, self.seen = False, []
+        self.looking, self.seen, self.others = False, [], frozenset()
         sys.addaudithook(self.hook)
 
     def hook(self, event, details):
-        if not self.looking:
+        if not self.looking or threading.get_ident() in self.others:
             return
         if event == "open":
             self.seen.append(("open", str(details[0]), details[2]))
@@ -73,7 +77,8 @@ class Watch:
 
     @contextmanager
     def look(self):
-        self.looking, self.seen = True, []
+        others = {thread.ident for thread in threading.enumerate()} - {threading.get_ident()}
+        self.looking, self.seen, self.others = True, [], frozenset(others)
         try:
             yield self.seen
         finally:
