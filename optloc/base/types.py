@@ -427,7 +427,7 @@ class Status(IntEnum):
 
 # Each sentence states first what happened, then what helps. Users read it without any code.
 _SENTENCES: dict[Status, str] = {
-    Status.OK: "Use it: the residuals fit the stated noise, no other position fits, and the error ellipse is valid.",
+    Status.OK: "Use it: the residuals fit the stated noise, no other solution fits, and the error ellipse is valid.",
     Status.AMBIGUOUS: "Several positions fit the data about equally well; see the alternatives, and add a station, a "
     "measurement or a known height that decides.",
     Status.SEARCHED: "No safe start is known for these kinds of measurements; this is the best position of a seeded "

@@ -122,14 +122,14 @@ def claim_sentence(margin: float, listed: int, region: tuple[Corner, Corner] | N
 
     `margin` is the proven gap of cost and `listed` the number of alternatives that the claim excepts, as in
     `state_claims`. `region` has the corners of the region, metres and metres per second; None means all positions.
-    Another position means another local minimum: chi-square rises continuously around the fix.
+    A solution is a local minimum. Positions near the fix have almost the same chi-square and are no other solution.
     """
     where = "" if region is None else f" {_where(*region)}"
     if margin <= 0.0:
         return f"no position{where} has a lower chi-square; other minima were searched for, not excluded"
     except_listed = "" if not listed else f" except the {'one' if listed == 1 else listed} listed"
     there = " there" if where else ""
-    return f"proven best{where}; any other position{there}{except_listed} raises chi-square by at least {margin:g}"
+    return f"proven best{where}; any other solution{there}{except_listed} raises chi-square by at least {margin:g}"
 
 
 def _where(lower: Corner, upper: Corner) -> str:

@@ -37,7 +37,7 @@ def test_a_clear_fix_is_proven_to_be_the_only_one(name):
     assert 0.0 <= float(fix.cost) - proof.bound == proof.gap <= 1.1e-6 * (1.0 + float(fix.cost))
     assert proof.boxes >= 0
     assert proof.region is None
-    assert proof.reason == "proven best; any other position raises chi-square by at least 25"
+    assert proof.reason == "proven best; any other solution raises chi-square by at least 25"
 
 
 def test_a_plain_method_is_not_proven_and_certify_proves_it():
@@ -112,7 +112,7 @@ def test_a_mirror_image_is_a_second_minimum_not_a_worse_one():
     np.testing.assert_allclose(fix.alternatives.x[0], fix.x * [1.0, 1.0, -1.0], atol=1e-3)
     proof = fix.certificate
     assert (proof.proof, proof.unique) == ("global", True)
-    assert "any other position except the one listed raises" in proof.reason
+    assert "any other solution except the one listed raises" in proof.reason
 
 
 @machine_code
