@@ -1,4 +1,4 @@
-"""Alarms: parts of a stream that do not work, and the delays after which they are tried again."""
+"""Alarms: parts of a stream that do not work, and the delays after which they are tried again or given up."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from optloc.problem import InvalidProblem
 
 FIRST_DELAY, LONGEST_DELAY = 1.0, 60.0
 """Seconds before the first new attempt, and the limit to which they double: a part works again within a minute."""
+
+PATIENCE = 5.0
+"""Seconds for which the end of a stream waits for a thread that cannot be interrupted, as in a write to a full pipe."""
 
 
 class Alarm(NamedTuple):

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import select
-import signal
-import stat
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
 from math import inf
 from pathlib import Path
-from threading import Event, current_thread, main_thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from optloc.cli import (
-    READER_GONE,
-    STOPPED,
     Budget,
     Force,
     Height,
@@ -36,20 +26,14 @@ from optloc.cli import (
     choice,
     example,
 )
-from optloc.files import claim, visible
+from optloc.files import visible
 from optloc.problem import InvalidProblem, nearest
-from optloc.service.http_options import AccessRules, Hosts, Http, NoToken, Tokens, access_of, address_of
+from optloc.service.http_options import Hosts, Http, NoToken, Tokens, access_of
 
 if TYPE_CHECKING:
-    from optloc.service.adapters import Adapter
-    from optloc.service.recording import Recorded
     from optloc.service.site import Site, SiteOptions
-    from optloc.service.stream import Stream
 
 # Import the stream inside the commands, so that --help prints without delay.
-
-# Thread switch interval, s: the first phase must not wait 5 ms for the second.
-_SWITCH = 5e-4
 
 Replay = Annotated[
     Path | None,
@@ -165,18 +149,20 @@ def live(
 
     The rows of FILE are the template of an event. Signals: TERM answers all waiting events and ends, HUP reloads FILE.
     """
+    from optloc.service.process import ServiceOptions, run_stream
+
+    stated = site_options(wave_speed, wind, two_way, turn_around, height)
     if check:
-        raise typer.Exit(run_check(file, method, site_options(wave_speed, wind, two_way, turn_around, height)))
-    settings = _settings(wait, late, phases, deadline, part, form) | {"state": state, "record": record}
+        raise typer.Exit(run_check(file, method, stated))
+    settings = _settings(wait, late, phases, deadline, part, form)
     settings |= _tracking(model, filter_, noise, gap, track=track)
-    settings["every"] = seconds_of(every, "--every")
+    settings |= {"state": state, "every": seconds_of(every, "--every"), "record": record}
     speed = inf if speed is None else speed
     options = ServiceOptions(
-        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq),
-        stated=site_options(wave_speed, wind, two_way, turn_around, height),
+        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq), stated=stated,
         access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
-    raise typer.Exit(run_live(file, options))
+    raise typer.Exit(run_stream(file, options))
 
 
 SERVED = example(
@@ -225,15 +211,17 @@ def serve(
 
     The command does not use standard input and standard output.
     """
-    settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
+    from optloc.service.process import ServiceOptions, run_stream
+
+    settings = _settings(wait, late, "two", deadline, part, "ndjson")
     settings |= _tracking(model, filter_, noise, gap, track=track)
-    settings["every"] = seconds_of(every, "--every")
+    settings |= {"state": state, "every": seconds_of(every, "--every"), "record": record}
     options = ServiceOptions(
         settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
         access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
-    raise typer.Exit(run_live(file, options))
+    raise typer.Exit(run_stream(file, options))
 
 
 def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str, form: str) -> dict[str, Any]:
@@ -269,113 +257,6 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
 
     dynamics = dynamics_of(TrackOptions(model, noise=noise))
     return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceOptions:
-    """Options of the commands `live` and `serve`.
-
-    settings: arguments of the stream settings except `shed`, which depends on the source. method: method of the fixes.
-    recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
-    proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
-    not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
-    recording. stdout: whether answers go to standard output. stated: options on the wave and the height, or None.
-    access: rules of access to HTTP, or None.
-    """
-
-    settings: dict[str, Any]
-    method: str = "auto"
-    recording: Path | None = None
-    speed: float = inf
-    shed: bool | None = None
-    quiet: bool = False
-    http: str | None = None
-    mqtt: str | None = None
-    zmq: str | None = None
-    adapter: str | None = None
-    stdin: bool = True
-    stdout: bool = True
-    stated: SiteOptions | None = None
-    access: AccessRules | None = None
-
-
-def run_live(file: Path, options: ServiceOptions) -> int:
-    """Run a stream until its source ends or a signal arrives, and return the exit code, as in `wait`.
-
-    `file` is the problem file of the site.
-    """
-    from optloc.service.adapters import adapter_of
-    from optloc.service.recording import read_recording
-    from optloc.service.site import read_site
-    from optloc.service.standard_error import standard_error
-    from optloc.service.stream import Settings, Stream
-
-    if not options.speed > 0.0:
-        raise InvalidProblem(f"the speed is {options.speed:g}, not positive", "--speed", "give a positive number")
-    site = read_site(file, options.method, options.stated)
-    adapter = None if options.adapter is None else adapter_of(options.adapter, site.stations)
-    recording = None if options.recording is None else read_recording(options.recording)
-    # lines of a file can wait, so no proof needs to be skipped
-    waits = recording is not None or (options.stdin and _is_file(sys.stdin))
-    shed = not waits if options.shed is None else options.shed
-    # If no proof is skipped, the default deadline is infinite. Settings that are None keep their default values.
-    given = options.settings | ({"deadline": inf} if not shed and options.settings.get("deadline") is None else {})
-    settings = Settings(shed=shed, **{key: value for key, value in given.items() if value is not None})
-    claim(settings.record, inputs=[file])
-    write = _write(sys.stdout.buffer) if options.stdout else _silent
-    with _threads(), standard_error(quiet=options.quiet) as (say, messages), ExitStack() as stops:
-        stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
-        stream.watch_output(messages)
-        stops.callback(stream.sources.stop)
-        stops.callback(stream.close)  # also if a source cannot be opened
-        if settings.track and stream.untracked:
-            raise InvalidProblem(stream.untracked, "--track", "remove this option")
-        interrupted = stops.enter_context(_signal_handlers(stream))  # before the first line is read
-        places = _open(options, stream, adapter)
-        say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
-        _read(options, stream, adapter, recording)
-        code = wait(stream, interrupted)
-        stream.sources.stop()  # so that no line comes after the last line of health
-        failed = stream.sources.failed
-        if failed:
-            say(f"The stream ends with exit code {code}, because these sources do not work: {', '.join(failed)}.")
-        say(json.dumps({"health": stream.health()}))
-    return code
-
-
-def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None) -> str:
-    """Start the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
-    from optloc.service import serve as requests
-    from optloc.service.sources import mqtt, zeromq
-
-    opened = ""
-    if options.http is not None:
-        host, port = address_of(options.http)
-        number, _ = requests.serve(stream, host, port, options.access)
-        opened = f", http://{f'[{host}]' if ':' in host else host}:{number}/"
-    for address, begin in ((options.mqtt, mqtt), (options.zmq, zeromq)):
-        if address is not None:
-            stream.start(begin(stream, address, adapter))
-    return opened
-
-
-def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
-    """Read a recording or standard input in a separate thread, if requested."""
-    from optloc.service.recording import replay
-    from optloc.service.sources import standard_input
-    from optloc.service.supervisor import LineSource, Watch
-
-    if recording is not None:
-        name = str(options.recording)
-
-        def run(_: Watch) -> None:
-            """Read the recording."""
-            replay(recording, stream, options.speed, name, adapter)
-
-        stream.start(LineSource(name, run, is_last=True, tries=0))  # a second attempt would repeat the first lines
-    elif options.stdin:
-        read, pending = _reader(sys.stdin)
-        stream.start(standard_input(stream, read, adapter, pending))
 
 
 def site_options(
@@ -419,134 +300,6 @@ def input_description(site: Site) -> Iterator[str]:
         if site.arriving and not site.others
         else f"all {len(site.rows)} rows"
     )
-
-
-SOURCE_FAILED = 3
-"""Exit code of a stream that ends while one of its sources does not work."""
-
-
-def wait(stream: Stream, interrupted: Event) -> int:
-    """Wait for the end of a stream and return its exit code; raise the error that ended the stream, if any.
-
-    The code is `STOPPED` after Ctrl-C (`interrupted` is set), `READER_GONE` if the output was closed, `SOURCE_FAILED`
-    if a source does not work, and 0 otherwise.
-    """
-    # on Windows, a wait without a timeout blocks signals
-    while not stream.ended.wait(1.0):
-        pass
-    if stream.error is not None:
-        raise stream.error
-    if interrupted.is_set() or stream.failed:
-        return STOPPED if interrupted.is_set() else READER_GONE
-    return SOURCE_FAILED if stream.sources.failed else 0
-
-
-@contextmanager
-def _signal_handlers(stream: Stream) -> Iterator[Event]:
-    """End a stream at SIGTERM or SIGINT, and reload its site at SIGHUP, within the block.
-
-    Yield an event that SIGINT (Ctrl-C) sets, since the exit code then differs.
-    """
-    interrupted = Event()
-
-    def stop(number: int, _: Any) -> None:
-        """End the stream at a signal."""
-        if number == signal.SIGINT:
-            interrupted.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C interrupts at once
-        stream.close()
-
-    with _signals({"SIGTERM": stop, "SIGINT": stop, "SIGHUP": lambda *_: stream.reload()}):
-        yield interrupted
-
-
-@contextmanager
-def _signals(handlers: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
-    """Handle signals by functions within the block: `handlers` has the functions by the name of the signal.
-
-    Signals that the operating system lacks are left out. Python allows handlers in the main thread only, so another
-    thread sets none.
-    """
-    if current_thread() is not main_thread():
-        yield
-        return
-    old = {name: signal.signal(getattr(signal, name), how) for name, how in handlers.items() if hasattr(signal, name)}
-    try:
-        yield
-    finally:
-        for name, how in old.items():
-            signal.signal(getattr(signal, name), how)
-
-
-# One processor suffices: batches of a stream are small. Without machine code, plain Python answers while a background
-# process compiles, if permitted.
-_ENVIRONMENT = {"OPTLOC_THREADS": "1", "OPTLOC_COMPILE": "child"}
-
-
-@contextmanager
-def _threads() -> Iterator[None]:
-    """Set a short thread switch interval, and the environment of a stream unless variables are already set."""
-    old, added = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
-    sys.setswitchinterval(_SWITCH)
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(old)
-        for name in added:
-            os.environ.pop(name, None)
-
-
-def _write(file: Any) -> Callable[[bytes], None]:
-    """Return a function that writes bytes to a binary file at once, without a buffer that delays answers."""
-
-    def write(data: bytes) -> None:
-        file.write(data)
-        file.flush()
-
-    return write
-
-
-def _reader(file: Any) -> tuple[Callable[[int], bytes], Callable[[], bool]]:
-    """Return a function that reads available bytes, and a function that returns whether bytes are available.
-
-    The first function takes the largest number of bytes. It reads the file descriptor without the lock of Python's
-    buffer, since the end of the process would wait for this lock. Files in memory have no descriptor: their second
-    function returns False.
-    """
-    try:
-        descriptor = file.fileno()
-    except (OSError, AttributeError, ValueError):
-        return file.buffer.read1, bool  # in memory, as in tests
-
-    def pending() -> bool:
-        """Return whether the file has bytes that can be read without waiting."""
-        try:
-            return bool(select.select([descriptor], [], [], 0.0)[0])
-        except (OSError, ValueError):
-            return False  # on Windows, select works for sockets only
-
-    def read(count: int) -> bytes:
-        """Return at most `count` available bytes; wait for the first byte."""
-        while True:
-            try:
-                return os.read(descriptor, count)
-            except BlockingIOError:  # the writer of the pipe has set the mode that never waits
-                select.select([descriptor], [], [])
-
-    return read, pending
-
-
-def _silent(_: str | bytes) -> None:
-    """Ignore a line: the output of `--quiet`, and of a command without standard output."""
-
-
-def _is_file(file: Any) -> bool:
-    """Return whether an input is a regular file, or in memory: its data can wait, unlike the data of a pipe."""
-    try:
-        return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
-    except (OSError, AttributeError, ValueError):
-        return True  # a stream without a file number is in memory, as in tests
 
 
 def part_of(text: str) -> tuple[int, int]:

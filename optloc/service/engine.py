@@ -176,8 +176,21 @@ class Engine:
                     late.append(item)
         self._give_up(late, "deadline")
 
+    def drop(self) -> None:
+        """Leave the waiting tracks and proofs without an answer, because no answer can be written."""
+        self.tracks.drop()
+        with self._changed:
+            for item in self._open:
+                item.done = True
+            self._waiting.clear()
+            self._open.clear()
+            self._changed.notify_all()
+
     def stop(self) -> None:
-        """Finish the waiting tracks and the proofs within their deadlines, and end."""
+        """Finish the waiting tracks and the proofs within their deadlines, and end.
+
+        A proof that runs beyond its deadline ends later, and its result is dropped; see `join`.
+        """
         self.tracks.stop()
         with self._changed:
             self._ends = True
@@ -188,6 +201,11 @@ class Engine:
             with self._changed:
                 if all(item.done for item in self._open):
                     return  # running proofs are already given up
+
+    def join(self, seconds: float) -> None:
+        """Wait at most `seconds` for the thread of the proofs, after `stop`."""
+        if self._thread.is_alive():
+            self._thread.join(seconds)
 
     # Batches.
 

@@ -13,14 +13,12 @@ from threading import Condition, Thread
 from time import monotonic
 from typing import Generic, TypeVar
 
-from optloc.service.alarms import FIRST_DELAY, LONGEST_DELAY, Alarm, sentence
+from optloc.service.alarms import FIRST_DELAY, LONGEST_DELAY, PATIENCE, Alarm, sentence
 
 T = TypeVar("T")
 
 # Size of the entries that are written together, bytes: on a nearly full disk, a part of a large queue still fits.
 _TOGETHER = 1 << 16
-PATIENCE = 5.0
-"""Seconds for which the end of the stream waits for an output, such as a pipe without a reader."""
 
 
 class SideOutput(Generic[T]):

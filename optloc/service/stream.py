@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event as Flag, Lock, Thread
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 from optloc.engine import enabled
 from optloc.files import access
 from optloc.service.account import total
 from optloc.service.adapters import Adapter, converted
-from optloc.service.alarms import Alarm, SourceLost, sentence
+from optloc.service.alarms import PATIENCE, Alarm, SourceLost, sentence
 from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_feed, to_line
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import BATCH, Engine, warm_up
@@ -98,6 +98,8 @@ class Settings:
 class Stream:
     """A service that reads lines, answers events and writes answers until it is closed.
 
+    It is a context manager: the end of the block closes the stream and waits for all its threads.
+
     Parameters
     ----------
     site : Site
@@ -114,6 +116,11 @@ class Stream:
         File of the site, for reloading.
     replayed : bool
         Whether lines have recorded times of reading: events then close by these times, at any replay speed.
+
+    Raises
+    ------
+    InvalidProblem
+        If the site cannot be solved, or if the state or the recording cannot be used. No thread then stays.
     """
 
     def __init__(
@@ -137,9 +144,7 @@ class Stream:
         # for a source that is a file: seconds that do not count for waiting, and whether it has more to read
         self.held = 0.0
         self.pending: Callable[[], bool] = bool
-        self._outbox = Outbox(write, self.inbox.close, self._settle)
         self._format = FORMATS[settings.format]
-        self._engine = self._new_engine(site)
         self._replies = Replies()
         self._events = Events(
             site, self.metrics, self._emit, settings.wait, settings.revise, settings.part, attach=self._replies.attach
@@ -148,7 +153,13 @@ class Stream:
         self._unsettled: dict[int, Event] = {}
         self._settling = Lock()
         self._imbalance: Alarm | None = None
+        self.ended = Flag()
+        self.error: Exception | None = None
+        warm_up(site, settings.phases)
+        # Threads start from here on, after all that can be refused.
         self._files = StreamFiles(settings.state, settings.record, self._events, self._time(), say)
+        self._outbox = Outbox(write, self.inbox.close, self._settle)
+        self._engine = self._new_engine(site)
         for output in self._files.outputs:
             self.watch_output(output)
         # before the first answer, so that the answers after a kill have higher revisions
@@ -162,10 +173,8 @@ class Stream:
             "open": lambda: len(self._events.open),
         }
         self.metrics.alarms["account", "lines"] = lambda: self._imbalance
-        self.ended = Flag()
-        self.error: Exception | None = None
-        warm_up(site, settings.phases)
-        Thread(target=self._run, name="optloc stream", daemon=True).start()
+        self._thread = Thread(target=self._run, name="optloc stream", daemon=True)
+        self._thread.start()
 
     def _new_engine(self, site: Site) -> Engine:
         """Return the engine of a site with the settings of the stream."""
@@ -232,8 +241,25 @@ class Stream:
         return self.clock() - self.held
 
     def close(self) -> None:
-        """Read no more lines, answer the waiting lines, and end."""
+        """Read no more lines, answer the waiting lines, and end; `ended` is set after the end of all threads."""
         self.inbox.close()
+
+    def __enter__(self) -> Self:
+        """Return the stream."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Close the stream, and wait for its end; raise the error that ended the stream, if any.
+
+        After an interrupt (Ctrl-C), nothing is waited for.
+        """
+        self.close()
+        if kind is not None and not issubclass(kind, Exception):
+            return
+        while self._thread.is_alive():
+            self._thread.join(1.0)  # on Windows, a wait without a timeout blocks signals
+        if kind is None and self.error is not None:
+            raise self.error
 
     def reload(self) -> None:
         """Reload the file of the site, if it is valid; open events are answered by the old site."""
@@ -253,27 +279,26 @@ class Stream:
     # The thread that answers.
 
     def _run(self) -> None:
-        """Answer lines until the end (the thread that answers); an error is stored for the thread that waits."""
-        try:
-            self._loop()
-        except Exception as error:  # noqa: BLE001  # raised in the thread that waits for the stream
-            self.error = error
-        try:
-            self._end()
-        except Exception as error:  # noqa: BLE001  # as above
-            self.error = self.error or error
-        finally:
-            self.ended.set()
+        """Answer lines until the end, then end all other threads (the thread that answers).
 
-    def _end(self) -> None:
-        """Drop the lines that are still waiting, write the last state and the rest of the recording, and end."""
-        self.inbox.close()
-        self.inbox.drop()
-        self._outbox.close()
-        self._check_account()
-        ended = self.error is None and not self._outbox.failed
-        self._files.checkpoint(lambda: self._state(ended=ended))
-        self._files.close()
+        An error of one step is stored for the thread that waits, and the other steps follow.
+        """
+        for step in (
+            self._loop,
+            self.inbox.close,
+            self._answer_rest,
+            self._stop_engine,
+            self.inbox.drop,
+            self.sources.stop,  # after the answers to their lines, and before the last checkpoint counts their lines
+            self._outbox.close,
+            self._store_end,
+            self._files.close,
+        ):
+            try:
+                step()
+            except Exception as error:  # noqa: BLE001  # raised in the thread that waits for the stream
+                self.error = self.error or error
+        self.ended.set()
 
     def _loop(self) -> None:
         """Read lines and answer closed events until the queue of lines is closed or the output fails."""
@@ -296,8 +321,6 @@ class Stream:
             if not (self._replayed or pending or len(self.inbox)):
                 self._events.due(self._time(), self.clock())
             self._do_timed_work()
-        if not self._outbox.failed:
-            self._finish()
 
     def _do_timed_work(self) -> None:
         """Answer closed events, then do the work that is due: deadlines, reload, health, recording and checkpoint."""
@@ -318,11 +341,29 @@ class Stream:
             self._next_state = now + self._settings.every
             self._files.checkpoint(self._state)
 
-    def _finish(self) -> None:
+    @property
+    def _can_write(self) -> bool:
+        """Return whether answers can be written: the stream has no error, and the output is open."""
+        return self.error is None and not self._outbox.failed
+
+    def _answer_rest(self) -> None:
         """Answer all waiting events."""
-        self._events.flush(self.clock())
-        self._answer_closed()
+        if self._can_write:
+            self._events.flush(self.clock())
+            self._answer_closed()
+
+    def _stop_engine(self) -> None:
+        """Finish the tracks and proofs, or drop them if they cannot be written, and wait for their threads."""
+        if not self._can_write:
+            self._engine.drop()
         self._engine.stop()
+        self._engine.join(PATIENCE)
+
+    def _store_end(self) -> None:
+        """Check the account, and write the last checkpoint."""
+        self._check_account()
+        ended = self._can_write
+        self._files.checkpoint(lambda: self._state(ended=ended))
 
     def _read(self, line: QueuedLine) -> None:
         """Read one line: add its rows to an event, or run its command; report an invalid line."""

@@ -10,15 +10,12 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
-from optloc.service.alarms import FIRST_DELAY, LONGEST_DELAY, Alarm, sentence
+from optloc.service.alarms import FIRST_DELAY, LONGEST_DELAY, PATIENCE, Alarm, sentence
 
 LOG = logging.getLogger("optloc.service")
-
-# Seconds for which the end of the stream waits for a source.
-_PATIENCE = 5.0
 
 
 class Watch:
@@ -63,6 +60,8 @@ class LineSource:
         Number of restarts without success after which the source is given up; infinity: never.
     interrupt : callable
         Called after `Watch.stopping` is set, for a source that does not look at it.
+    patience : float
+        Seconds for which the end of the stream waits for the thread of the source.
     """
 
     name: str
@@ -70,6 +69,7 @@ class LineSource:
     is_last: bool = False
     tries: float = inf
     interrupt: Callable[[], None] = lambda: None
+    patience: float = PATIENCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,7 @@ class RunningSource:
     def stop(self) -> None:
         """End the source, and wait some seconds for its thread."""
         self.interrupt()
-        if not self.source.is_last:  # a read of standard input cannot be interrupted
-            self.thread.join(_PATIENCE)
+        self.thread.join(self.source.patience)
 
 
 class Supervisor:
@@ -115,22 +114,28 @@ class Supervisor:
         watched: Callable[[Watch], None] = lambda watch: None,
     ) -> None:
         self._close, self._report, self._clock, self._watched = close, report, clock, watched
-        self._running: list[RunningSource] = []
+        self._lock, self._running, self._ends = Lock(), list[RunningSource](), False
 
     def start(self, source: LineSource) -> RunningSource:
-        """Run a source in a separate thread until it ends, is given up, or is stopped."""
+        """Run a source in a separate thread until it ends, is given up or is stopped; after `stop`, it does not run."""
         watch = Watch(source.name, self._clock, self._report)
         self._watched(watch)
         thread = Thread(target=self._run, args=(source, watch), name=f"optloc {source.name}", daemon=True)
-        self._running.append(running := RunningSource(source, watch, thread))
-        thread.start()
+        running = RunningSource(source, watch, thread)
+        with self._lock:
+            if self._ends:
+                watch.stopping.set()
+            self._running.append(running)
+            thread.start()
         return running
 
     def stop(self) -> None:
         """End all sources, and wait some seconds for each."""
-        for running in self._running:
+        with self._lock:
+            self._ends, stopped = True, list(self._running)
+        for running in stopped:
             running.interrupt()
-        for running in self._running:
+        for running in stopped:
             running.stop()
 
     @property

@@ -130,6 +130,12 @@ class Tracks:
         if self._thread is not None:
             self._thread.join()
 
+    def drop(self) -> None:
+        """Leave the waiting events without an answer."""
+        with self._changed:
+            self._waiting.clear()
+            self._changed.notify_all()
+
     def records(self) -> list[Record]:
         """Return the last answer of each stored track, with the seconds since then (`age`), the latest first."""
         with self._changed:

@@ -15,7 +15,7 @@ from benchmarks.test_latency import general
 from data.windows import report
 from service.lines import Answers, arrivals, balanced, differences, line, site_in, slowed
 
-from optloc.service.command import _threads
+from optloc.service.process import _threads
 from optloc.service.stream import Settings, Stream
 
 EVENTS = 20_000

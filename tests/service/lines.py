@@ -11,7 +11,7 @@ import numpy as np
 from optloc.problem.build import Problem
 from optloc.service.account import SETTLED
 from optloc.service.site import read_site
-from optloc.service.sources import read_lines
+from optloc.service.standard_input import read_lines
 from optloc.service.stream import Settings, Stream
 from optloc.solvers import solve
 

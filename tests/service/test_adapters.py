@@ -8,7 +8,7 @@ from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
 from optloc.problem import InvalidProblem
 from optloc.service.adapters import ChirpStack, ModeS, adapter_of, converted
 from optloc.service.site import FAST
-from optloc.service.sources import read_lines
+from optloc.service.standard_input import read_lines
 from optloc.service.stream import Settings, Stream
 
 

@@ -1,24 +1,17 @@
 """Options of optloc live and serve: parts, times, words, tracks, and what --check tells of a site."""
 
-import os
-import sys
-from threading import Event as Flag
-from types import SimpleNamespace
-
 import pytest
 from service.lines import site_in
 
 from optloc import InvalidProblem
 from optloc.service.command import (
     _settings,
-    _threads,
     _tracking,
     input_description,
     one_of,
     part_of,
     run_check,
     seconds_of,
-    wait,
 )
 from optloc.service.messages import parse
 from optloc.service.site import FAST
@@ -59,29 +52,3 @@ def test_each_line_that_check_shows_is_one_that_the_site_takes(tmp_path, capsys)
         assert parse(b"{" + text.encode(), site).event == "1"
     assert run_check(tmp_path / "site.toml", FAST) == 0
     assert "Six receivers: 5 rows of 6 stations" in capsys.readouterr().out
-
-
-def test_a_stream_ends_with_the_code_of_what_ended_it():
-    ended, not_set, pressed = Flag(), Flag(), Flag()
-    ended.set()
-    pressed.set()
-    sources, broken = SimpleNamespace(failed=[]), SimpleNamespace(failed=["mqtt"])
-    good = SimpleNamespace(ended=ended, error=None, failed=False, sources=sources)
-    gone = SimpleNamespace(ended=ended, error=None, failed=True, sources=sources)
-    lost = SimpleNamespace(ended=ended, error=None, failed=False, sources=broken)
-    assert wait(good, not_set) == 0
-    assert wait(lost, not_set) == 3
-    assert len({wait(each, not_set) for each in (good, gone, lost)} | {wait(lost, pressed)}) == 4
-    with pytest.raises(InvalidProblem, match="the site"):
-        wait(SimpleNamespace(ended=ended, error=InvalidProblem("the site is gone", None, ""), failed=False), not_set)
-
-
-def test_the_environment_of_a_stream_ends_with_it(monkeypatch):
-    monkeypatch.delenv("OPTLOC_THREADS", raising=False)
-    monkeypatch.setenv("OPTLOC_COMPILE", "wait")
-    before = sys.getswitchinterval()
-    with _threads():
-        assert (os.environ["OPTLOC_THREADS"], os.environ["OPTLOC_COMPILE"]) == ("1", "wait")
-        assert sys.getswitchinterval() < before
-    assert "OPTLOC_THREADS" not in os.environ
-    assert sys.getswitchinterval() == before

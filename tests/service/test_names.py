@@ -11,7 +11,7 @@ from optloc.service.events import Events
 from optloc.service.messages import parse
 from optloc.service.metrics import Metrics
 from optloc.service.site import FAST, UnknownName
-from optloc.service.sources import read_lines
+from optloc.service.standard_input import read_lines
 from optloc.service.stream import Settings, Stream
 
 

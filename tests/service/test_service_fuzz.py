@@ -21,9 +21,9 @@ ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 
 from optloc.base.errors import InvalidProblem  # noqa: E402
 from optloc.service.adapters import adapter_of  # noqa: E402
+from optloc.service.brokers import _push, zeromq  # noqa: E402
 from optloc.service.openapi import REFUSALS  # noqa: E402
 from optloc.service.serve import serve  # noqa: E402
-from optloc.service.sources import _push, zeromq  # noqa: E402
 from optloc.service.stream import Settings, Stream  # noqa: E402
 
 FEW, MANY = 500, 20_000

@@ -10,11 +10,14 @@ import time
 import numpy as np
 import pytest
 from often import few
+from service import lines as shared
+from service.broker import wait_for
 from service.lines import EPOCH, SITE, Answers, answers, arrivals, differences, line, site_in, slowed, solved
 from typer.testing import CliRunner
 
 from optloc.cli import app
 from optloc.files import load
+from optloc.problem import InvalidProblem
 from optloc.service.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import PENDING, Engine
@@ -23,7 +26,7 @@ from optloc.service.messages import parse
 from optloc.service.metrics import COUNTS, Metrics
 from optloc.service.queues import WAITING, Ticket
 from optloc.service.site import FAST
-from optloc.service.sources import read_lines
+from optloc.service.standard_input import read_lines
 from optloc.service.stream import Settings, Stream
 from optloc.solvers import solve
 
@@ -618,9 +621,72 @@ def test_a_signal_lets_it_answer_all_and_end(tmp_path):
     assert json.loads(told[-1])["health"]["events"] == 4
 
 
-def test_a_reader_that_goes_ends_it(tmp_path):
-    site_in(tmp_path)
+def threads_of_streams():
+    return {each.name for each in threading.enumerate()} & {f"optloc {name}" for name in ("stream", "output", "proofs")}
 
+
+def test_the_end_of_the_block_answers_all_and_leaves_no_thread(site):
+    out = Answers()
+    _, lines = whole(site, 20)
+    with Stream(site, Settings(shed=False, deadline=1e6), out) as stream:
+        stream.inbox.put(stream.lines(lines, "test"))
+        assert threads_of_streams() == {"optloc stream", "optloc output", "optloc proofs"}
+    assert len(out.records) == 40
+    assert threads_of_streams() == set()
+
+
+@pytest.mark.parametrize("step", ["_do_timed_work", "_answer_rest", "_store_end"])
+def test_an_error_of_the_stream_is_raised_and_leaves_no_thread(site, tmp_path, monkeypatch, step):
+    def fail(_):
+        raise ZeroDivisionError("of the stream")
+
+    monkeypatch.setattr(Stream, step, fail)
+    state = tmp_path / "s.state"
+    stream = Stream(site, Settings(state=state), Answers())
+    with pytest.raises(ZeroDivisionError, match="of the stream"), stream:
+        stream.inbox.put(stream.lines([line(event="1", z=[1.0] * 5)], "test"))
+    assert threads_of_streams() == set()
+    assert not (tmp_path / "s.state.lock").exists()
+
+
+def test_an_error_in_the_block_ends_the_stream_and_an_interrupt_waits_for_nothing(fast):
+    with pytest.raises(InvalidProblem, match="no source"), Stream(fast, Settings(), Answers()):
+        raise InvalidProblem("no source", None, "name one")
+    assert threads_of_streams() == set()
+    free = threading.Event()
+    stream = Stream(fast, Settings(phases="fix"), lambda data: free.wait(60.0))
+    stream.inbox.put(stream.lines([line(event="1", z=[1.0] * 5)], "test"))
+    with pytest.raises(KeyboardInterrupt), stream:
+        raise KeyboardInterrupt
+    assert not stream.ended.is_set()
+    free.set()
+    assert stream.ended.wait(20.0)
+
+
+def test_the_proofs_of_a_stream_whose_reader_goes_are_dropped(site, monkeypatch):
+    reads, proves = threading.Event(), threading.Event()
+    monkeypatch.setattr(shared, "Slow", lambda prepared, busy: lambda z: proves.wait(30.0) and prepared(z))
+
+    def write(data):
+        reads.wait(30.0)
+        raise BrokenPipeError
+
+    _, lines = whole(site, 200)
+    proves.set()  # the stream proves simulated events before its first line
+    stream = Stream(slowed(site), Settings(shed=False, deadline=1e6), write)
+    proves.clear()
+    stream.inbox.put(stream.lines(lines, "test"))
+    wait_for(lambda: stream.health()["queues"]["proofs"] > 100)
+    reads.set()
+    wait_for(lambda: stream.health()["queues"]["proofs"] == 0)
+    proves.set()
+    assert stream.ended.wait(20.0)
+    assert stream.health()["account"]["test"]["open"] == 200
+    assert stream.health()["proofs"] == {}
+    assert threads_of_streams() <= {"optloc stream"}  # which ends now
+
+
+def test_a_reader_that_goes_ends_it(tmp_path):
     class Gone:
         def __call__(self, data):
             raise BrokenPipeError

@@ -45,6 +45,28 @@ def test_a_source_that_fails_runs_again_and_is_reported_once():
     assert not kept.closed.is_set()
 
 
+def test_a_source_that_starts_after_the_stop_does_not_run():
+    kept, runs = Kept(), []
+    kept.now.stop()
+    running = kept.now.start(LineSource("mqtt", runs.append))
+    running.thread.join(10.0)
+    assert (runs, running.thread.is_alive(), kept.closed.is_set()) == ([], False, False)
+
+
+def test_the_stop_waits_as_long_as_a_source_permits():
+    kept, free = Kept(), threading.Event()
+    waited, left = (
+        kept.now.start(LineSource(name, lambda watch: free.wait(10.0), interrupt=interrupt, patience=patience))
+        for name, interrupt, patience in (("waited", free.set, 10.0), ("left", lambda: None, 0.0))
+    )
+    left.stop()
+    assert left.thread.is_alive()
+    waited.stop()
+    assert not waited.thread.is_alive()
+    kept.now.stop()
+    left.thread.join(10.0)
+
+
 def test_the_delay_doubles_to_its_limit_and_starts_again_after_a_success(monkeypatch):
     monkeypatch.setattr(supervisor, "LONGEST_DELAY", 0.03)
     kept, delays, runs = Kept(), [], []

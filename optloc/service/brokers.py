@@ -1,9 +1,8 @@
-"""Sources of lines: standard input, and the brokers MQTT and ZeroMQ."""
+"""Sources of lines: the brokers MQTT and ZeroMQ."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -15,83 +14,12 @@ from optloc.service.queues import WAITING
 from optloc.service.stream import Stream
 from optloc.service.supervisor import LineSource, Watch
 
-# Share of the time that does not count for waiting events while lines wait to be read. Rows of an event that were
-# written together then stay together at any reading speed, and events with missing rows still close.
-_UNCOUNTED = 0.98
-# Restarts of a failing standard input: an error of a terminal may pass, an error of a device does not.
-_TRIES = 3
 # Seconds between two looks at whether a source must end.
 _LOOK = 0.2
 # Seconds after which MQTT tests the connection to a silent broker.
 _KEEPALIVE = 30
-
-
-def standard_input(
-    stream: Stream,
-    read: Callable[[int], bytes],
-    adapter: Adapter | None = None,
-    pending: Callable[[], bool] = bool,
-) -> LineSource:
-    """Return standard input as a source, with whose end the stream ends; the arguments are as in `read_lines`."""
-
-    def run(watch: Watch) -> None:
-        """Read standard input until its end."""
-
-        def watched(count: int) -> bytes:
-            data = read(count)
-            watch.works()
-            return data
-
-        read_lines(watched, stream, watch.name, adapter, pending)
-
-    return LineSource("stdin", run, is_last=True, tries=_TRIES)
-
-
-def read_lines(
-    read: Callable[[int], bytes],
-    stream: Stream,
-    source: str,
-    adapter: Adapter | None = None,
-    pending: Callable[[], bool] = bool,
-) -> None:
-    """Read lines until the end and pass them to a stream; while the queue is full, nothing is read.
-
-    Parameters
-    ----------
-    read : callable
-        Returns at most the given number of bytes, as soon as any are available; empty at the end.
-    stream : Stream
-        Receives the lines.
-    source : str
-        Name of the source for messages.
-    adapter : callable, optional
-        Converts input lines to lines of a stream.
-    pending : callable
-        Returns whether input is available: then the time between two reads hardly counts for waiting events.
-    """
-    rest, number, last = b"", 0, stream.clock()
-    stream.pending = pending
-    try:
-        while True:
-            waited = pending()  # then the input waits for this thread, not this thread for the input
-            if not (piece := read(LINE)):
-                break
-            now = stream.clock()
-            stream.held += _UNCOUNTED * (now - last) if waited else 0.0
-            last = now
-            *whole, rest = (rest + piece).split(b"\n")
-            if len(rest) > 2 * LINE:
-                rest = rest[: LINE + 1]  # the beginning suffices to reject a line that is too long
-            stream.inbox.put(stream.lines(whole, source, number + 1, adapter=adapter))
-            number += len(whole)
-            if stream.inbox.closed:
-                return
-    finally:
-        stream.pending = bool
-    stream.inbox.put(stream.lines([rest], source, number + 1, adapter=adapter))
-
-
-# Brokers.
+# Seconds to connect to a broker: less than the seconds for which the end of the stream waits for the source.
+_CONNECT = 4.0
 
 
 def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
@@ -151,6 +79,7 @@ def _mqtt_client(parts: Any) -> Any:
 
     # Version 2 of the callbacks: version 1 will be removed in the next release.
     client = paho.Client(CallbackAPIVersion.VERSION2)
+    client.connect_timeout = _CONNECT
     if parts.scheme == "mqtts":
         client.tls_set()
     if parts.username:

@@ -1,4 +1,4 @@
-"""Sources: MQTT and ZeroMQ with restarts of the broker, and standard input that fails."""
+"""Brokers: MQTT and ZeroMQ, with restarts of the broker."""
 
 import json
 import socket
@@ -11,14 +11,11 @@ from shutil import which
 import pytest
 from service.broker import Broker, wait_for
 from service.lines import Answers, line, site_in
-from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
-from optloc.cli import app
-from optloc.service.adapters import adapter_of
+from optloc.service.brokers import mqtt, zeromq
 from optloc.service.queues import Inbox, QueuedLine
 from optloc.service.site import FAST
-from optloc.service.sources import mqtt, standard_input, zeromq
 from optloc.service.stream import Settings, Stream
 
 
@@ -30,11 +27,9 @@ def site(tmp_path_factory):
 @pytest.fixture
 def stream(site):
     out = Answers()
-    made = Stream(site, Settings(phases="fix"), out)
-    made.out = out
-    yield made
-    made.close()
-    assert made.ended.wait(10.0)
+    with Stream(site, Settings(phases="fix"), out) as made:
+        made.out = out
+        yield made
 
 
 def running(stream, source):
@@ -124,6 +119,16 @@ def test_a_broker_that_refuses_is_an_alarm(stream, broker):
     assert "the broker refuses (" in watch.alarm.error
     broker.refuses = False
     wait_for(lambda: watch.alarm is None)
+
+
+def test_a_source_that_waits_for_its_broker_ends_with_its_stream(stream, broker):
+    made = stream.start(mqtt(stream, f"mqtt://127.0.0.1:{broker.port}/t"))
+    wait_for(lambda: broker.subscribers == 1)
+    broker.stop()
+    wait_for(lambda: made.watch.restarts >= 1)  # the next attempt is two seconds later
+    stream.close()
+    assert stream.ended.wait(10.0)
+    assert not made.thread.is_alive()
 
 
 @pytest.mark.slow
@@ -240,37 +245,3 @@ def test_a_publisher_that_restarts_is_an_alarm_until_it_is_back(stream):
     watch = running(stream, zeromq(stream, place[0]))
     check_restart(stream, watch, publish, sockets[-1].close, start)
     context.destroy(0)
-
-
-# Standard input.
-
-
-def test_standard_input_that_fails_for_good_is_no_end_without_an_error(stream, monkeypatch):
-    monkeypatch.setattr("optloc.service.supervisor.FIRST_DELAY", 0.01)
-    pieces = [line(event="1", z=[1.0] * 5) + b"\n", OSError(5, "Input/output error"), b"2\n"]
-
-    def read(_):
-        piece = pieces.pop(0) if pieces else OSError(5, "Input/output error")
-        if isinstance(piece, OSError):
-            raise piece
-        return piece
-
-    watch = running(stream, standard_input(stream, read))
-    assert stream.ended.wait(20.0)
-    assert watch.alarm.error == "OSError: [Errno 5] Input/output error"
-    assert stream.sources.failed == ["stdin"]
-    assert stream.health()["account"]["stdin"]["received"] == 2
-
-
-def test_unknown_formats_and_addresses_are_one_sentence(tmp_path):
-    site_in(tmp_path)
-    for words, said in (
-        (["--adapter", "chirpstak"], "did you mean 'chirpstack'?"),
-        (["--http", "port"], "'port' is not a port"),
-        (["--mqtt", "x"], "is not an address of a topic"),
-    ):
-        result = CliRunner().invoke(app, ["live", str(tmp_path / "site.toml"), *words])
-        assert (result.exit_code, len(result.output.splitlines())) == (2, 1), result.output
-        assert said in result.output
-    with pytest.raises(InvalidProblem):
-        adapter_of("none", ())
