@@ -30,6 +30,8 @@ _NOT_COVERED = (
     "The position is refined, but no proof covers the problem, as the reason states, so another position is not "
     "excluded; compare it with other data, or accept this status with 'allow'."
 )
+# Sentence of each status, by its number.
+_OF_STATUS = np.array([Status(number).sentence for number in range(len(Status))], dtype=object)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,14 +123,16 @@ def merged_claims(chosen: Array, one: Claims, other: Claims) -> Claims:
     return Claims(*(np.where(chosen, *pair) for pair in pairs))
 
 
-def sentence_of(status: Status, claims: Claims) -> str:
-    """Return the sentence of the status of one fix, with advice that its method has not yet followed.
+def sentences_of(code: Array, claims: Claims) -> Array:
+    """Return the sentences of statuses as an object array (...), with advice that the method has not yet followed.
 
-    `claims` is the certificate of the fix, each field of shape ().
+    `code` (...) has the numbers of the statuses, and `claims` (...) the certificates of the fixes.
     """
-    if status is not Status.UNPROVEN:
-        return status.sentence
-    if str(claims.method) in NO_PROOF_METHODS:
-        return _WITHOUT_PROOF
+    sentences = np.asarray(_OF_STATUS[code], dtype=object)  # an index without axes gives a text
+    unproven = code == Status.UNPROVEN
+    if not unproven.any():
+        return sentences
     # A proof that examined no box was not begun: the problem is outside of its scope.
-    return _NOT_COVERED if claims.proof == UNKNOWN and not claims.boxes else status.sentence
+    not_covered = unproven & (claims.proof == UNKNOWN) & (claims.boxes == 0)
+    sentences = np.where(not_covered, _NOT_COVERED, sentences)
+    return np.where(unproven & np.isin(claims.method, NO_PROOF_METHODS), _WITHOUT_PROOF, sentences)

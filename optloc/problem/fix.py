@@ -18,7 +18,7 @@ from optloc.base.plots import plot_of
 from optloc.base.records import Axes, change
 from optloc.base.types import HAS_ANSWER, NOTES, PRECEDENCE, Array, Certificate, Status, statuses_of
 from optloc.problem.chart import CARTESIAN, Chart, Extent, tail_probability
-from optloc.problem.claims import Claims, sentence_of
+from optloc.problem.claims import Claims, sentences_of
 from optloc.problem.determined import Determined
 from optloc.problem.explanations import Suspect
 from optloc.problem.fix_parts import Alternatives, Stage
@@ -417,8 +417,12 @@ class Fix:
 
     @property
     def sentence(self) -> str:
-        """Return the sentence of the status of a single fix, with advice that its method has not yet followed."""
-        return sentence_of(Status(int(self.code)), self.claims)
+        """Return the sentence of the status of a single fix, with advice that its method has not yet followed.
+
+        For a batch, the result is an object array (...) of such sentences.
+        """
+        found = sentences_of(np.asarray(self.code), self.claims)
+        return cast("str", found if self.shape else found[()])
 
     def covers(self, points: Array, level: float = 0.95) -> Array:
         """Return whether points are in the regions that contain the target with a given probability.

@@ -230,8 +230,8 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
     `wait` and `deadline` are texts with a unit. `late` is "drop" or "revise", and `part` a text such as "1/4". A
     deadline of None is decided later: it depends on the source.
     """
-    from optloc.service.answers import FORMATS
     from optloc.service.engine import PHASES
+    from optloc.service.feeds import FORMATS
 
     return {
         "wait": seconds_of(wait, "--wait"),

@@ -152,7 +152,7 @@ class Engine:
                 self._offer([Pending(e, group.ready, z, None, e.stamp + self._deadline) for e, z in _pairs(group)])
                 continue
             last = self._phases == "fix"
-            records = self._fixed(group, "fix")
+            records = self._fixed(group, "fix", pending=not last)
             self._metrics.took("fix", [self._clock() - event.stamp for event in group.events])
             for event, record in zip(group.events, records, strict=True):
                 self._answer(event, record, last or "error" in record)
@@ -274,10 +274,10 @@ class Engine:
                 LOG.warning("%s: %s; %s", self.site.source, one.seen, one.advice)
         return [group] if kept else []
 
-    def _fixed(self, group: EventGroup, phase: str | None) -> list[Record]:
-        """Return the answers of the first phase (n); if the solver fails, each answer has the error."""
+    def _fixed(self, group: EventGroup, phase: str | None, *, pending: bool = False) -> list[Record]:
+        """Return the answers of the first phase (n), as `fix_records`; if the solver fails, each has the error."""
         try:
-            return fix_records(group.ready.fast(group.z), group.events, phase)
+            return fix_records(group.ready.fast(group.z), group.events, phase, pending=pending)
         except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
             return self._failed(group, error)
 
@@ -328,10 +328,11 @@ class Engine:
         self._metrics.add("overdue" if why == "deadline" else "skipped", len(items))
         for group in _grouped([item for item in items if item.before is None]):
             for event, record in zip(group.events, self._fixed(group, None), strict=True):
-                self._answer(event, record if "error" in record else record | unproven(event, why, None), last=True)
+                whole = record if "error" in record else unproven(event, why, record, answered=False)
+                self._answer(event, whole, last=True)
         for item in items:
             if item.before is not None:
-                self._answer(item.event, unproven(item.event, why, item.before), last=True)
+                self._answer(item.event, unproven(item.event, why, item.before, answered=True), last=True)
 
     def _prove(self) -> None:
         """Compute the waiting proofs in batches until the engine ends (the second thread)."""

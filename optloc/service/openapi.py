@@ -130,6 +130,7 @@ def _schemas() -> dict[str, Any]:
         "client": {"type": "string"},
         "target": {"type": "string"},
         "status": {"type": "string", "description": "status of the fix, or of the track"},
+        "sentence": {"type": "string", "description": "meaning of the status, with advice"},
         "reason": {"type": "string"},
         "position": {**vector, "description": "metres in the frame of the site; null without a position"},
         "velocity": vector,

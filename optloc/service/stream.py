@@ -20,10 +20,11 @@ from optloc.files import access
 from optloc.service.account import total
 from optloc.service.adapters import Adapter, converted
 from optloc.service.alarms import PATIENCE, Alarm, SourceLost, sentence
-from optloc.service.answers import FORMATS, OF_RECORDS, Latest, Record, to_feed, to_line
+from optloc.service.answers import Record, to_line
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import BATCH, Engine, warm_up
 from optloc.service.events import Event, Events, RefusedRepeat
+from optloc.service.feeds import FORMATS, OF_RECORDS, Latest, to_feed
 from optloc.service.messages import parse, shown_name
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
@@ -65,7 +66,7 @@ class Settings:
     part : (int, int)
         Number of this process, and number of processes.
     format : str
-        A key of `optloc.service.answers.FORMATS`.
+        A key of `optloc.service.feeds.FORMATS`.
     state : Path, optional
         Checkpoint; restored at the start if it exists.
     record : Path, optional

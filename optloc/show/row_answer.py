@@ -157,11 +157,22 @@ class RowSource(NamedTuple):
     @property
     def answer(self) -> FixAnswer:
         """Return the answer of the row."""
+        return row_answer(self.columns, self.number, self._fix, sentence=self.sentence)
+
+    @property
+    def status_sentence(self) -> str:
+        """Return the sentence of the status, as in the answer; empty for an unknown status."""
+        fix = None if self.sentence else self._fix
+        words = self.sentence or ("" if fix is None else fix.sentence)
+        return dict(use_rows(self.columns, self.number, words)).get("", "")
+
+    @property
+    def _fix(self) -> Fix | None:
+        """Return the fix of the row; None without one, or if it adds nothing to the row."""
         # A fix with status `ok` and a valid ellipse adds nothing to its row.
         label, chart = (self.columns[name][self.number] if name in self.columns else "" for name in ("status", "chart"))
         enough = label == Status.OK.label and chart in {"", NAMES[CARTESIAN]}
-        fix = None if self.fixes is None or enough else self.fixes[self.item]
-        return row_answer(self.columns, self.number, fix, sentence=self.sentence)
+        return None if self.fixes is None or enough else self.fixes[self.item]
 
 
 def state_table(frame: Frame, position: Array, covariance: Array, rates: Array | None = None, **texts: Any) -> Columns:

@@ -10,7 +10,7 @@ from optloc import simulate, solve
 from optloc.base.records import join, overwrite, take
 from optloc.base.types import Status
 from optloc.problem import Certificate
-from optloc.problem.claims import claim, empty_claims, merged_claims, repeated_claims, sentence_of
+from optloc.problem.claims import claim, empty_claims, merged_claims, repeated_claims, sentences_of
 
 GIVEN = [
     Certificate("global", "proven best", "branch and bound", 1.0, 1e-9, True, 9.0, 57),
@@ -80,7 +80,7 @@ def test_certificates_are_told_once():
     ],
 )
 def test_the_advice_for_an_unproven_fix_is_a_step_that_was_not_taken(certificate, advice, absent):
-    sentence = sentence_of(Status.UNPROVEN, claim(certificate))
+    sentence = sentences_of(np.asarray(Status.UNPROVEN), claim(certificate))[()]
     assert advice in sentence
     assert absent not in sentence
-    assert sentence_of(Status.CURVED, claim(certificate)) == Status.CURVED.sentence
+    assert sentences_of(np.asarray(Status.CURVED), claim(certificate))[()] == Status.CURVED.sentence

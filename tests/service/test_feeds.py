@@ -1,4 +1,4 @@
-"""Feeds of other programs in the default two phases: they carry the proven fix, and parsers of others read them."""
+"""Feeds: records in other formats, the latest fixes, and streams whose feeds are read by parsers of others."""
 
 import contextlib
 import json
@@ -8,13 +8,93 @@ import subprocess
 import time
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
 from service.lines import Answers, arrivals, differences, line, solved
 
+from optloc.base.frames import ECEF
+from optloc.base.types import Status
+from optloc.service.feeds import FORMATS, Latest, to_aircraft, to_feature, to_mark
 from optloc.service.stream import Settings, Stream
+from optloc.show.formats import FORMATS as FILE_FORMATS
 
+PLACE = {"lat_deg": 47.5, "lon_deg": 11.25, "height": 3048.0}
+X = ECEF.from_geodetic(np.radians(47.5), np.radians(11.25), 3048.0)
+FIX = {"event": "7", "phase": "fix", "status": "ok", "position": X.tolist(), "cov": np.eye(3).tolist(), **PLACE}
 COUNT = 3
 TIME = 1_700_000_000.25
+
+
+def test_a_mark_has_the_sentence_of_its_record():
+    assert "ok. Wait for it. latitude" in to_mark(FIX | {"sentence": "Wait for it."}, ECEF).words
+    assert Status.OK.sentence in to_mark(FIX, ECEF).words
+    moving = FIX | {"status": "started", "nis": None, "velocity": [1.0, 2.0, 3.0], "cov": np.eye(6).tolist()}
+    assert "velocity x: 1.0 ± 1.0 m/s" in to_mark(moving, ECEF).words
+
+
+def test_features_and_aircraft_have_the_place_on_earth():
+    bare = {name: value for name, value in FIX.items() if name != "cov"}
+    feature = to_feature(bare, ECEF)
+    assert feature["geometry"]["coordinates"] == [11.25, 47.5, 3048.0]
+    assert feature["properties"] == {"event": "7", "phase": "fix", "status": "ok"}
+    assert to_feature({"event": "7", "status": "stalled", "position": None}, ECEF)["geometry"] is None
+    assert (to_aircraft(FIX)["alt_geom"], to_aircraft(FIX)["hex"]) == (10000, "7")  # feet
+
+
+def test_a_feature_has_the_ellipse_and_the_sigmas_of_an_ok_fix_only():
+    record = FIX | {"cov": np.diag([9.0, 9.0, 9.0]).tolist()}
+    found = to_feature(record, ECEF)["properties"]
+    assert [found[f"sigma_{axis}"] for axis in ("east", "north", "up")] == pytest.approx([3.0, 3.0, 3.0])
+    # 5.991 is the 95 % quantile of chi-square with two degrees of freedom
+    assert found["ellipse95_1"] == pytest.approx(3.0 * np.sqrt(5.991), rel=1e-4)
+    assert "ellipse95_1" not in to_feature(record | {"status": "misfit"}, ECEF)["properties"]
+
+
+def test_a_mark_is_at_the_position_of_its_record():
+    mark = to_mark(FIX | {"alternatives": [{"position": (X + 1e3).tolist(), "gap": 2.0}]}, ECEF)
+    assert (mark.status, mark.name) == ("ok", "7")
+    (other,) = mark.others
+    np.testing.assert_allclose(other.position, X + 1e3)
+    assert other.probability == pytest.approx(1.0 / (1.0 + np.e))
+
+
+def test_every_format_writes_a_fix_and_those_of_maps_leave_out_what_has_no_place():
+    nowhere = {"event": "7", "phase": "fix", "status": "stalled", "position": None}
+    for name, write in FORMATS.items():
+        assert b"7" in write(FIX, ECEF), name
+        assert (write(nowhere, ECEF) is None) == (name not in ("ndjson", "geojson")), name
+    assert set(FORMATS) - set(FILE_FORMATS) <= {"ndjson", "aircraft", "geojson"}
+
+
+def test_the_latest_fix_of_each_target_is_kept_and_the_oldest_leave():
+    latest = Latest(most=2)
+    for name in "abc":
+        latest(FIX | {"event": name, "phase": "fix"})
+    latest({"event": "c", "phase": "proof", "proof": "global"})
+    latest({"event": "d", "position": None})
+    found = latest.features(ECEF)["features"]
+    assert [feature["properties"]["event"] for feature in found] == ["b", "c"]
+    assert found[1]["properties"]["proof"] == "global"
+    assert latest.aircraft()["messages"] == 3
+
+
+def test_marks_have_trails_of_their_targets():
+    latest = Latest()
+    assert latest.marks(ECEF) | {"now": 0.0} == {"now": 0.0, "last": None, "fixes": []}
+    for i in range(3):
+        place = [FIX["position"][0] + 10.0 * i, *FIX["position"][1:]]
+        latest(FIX | {"event": f"e{i}", "target": "T", "position": place})
+    latest({"event": "e2", "phase": "proof", "status": "ok", "target": "T", "proof": "global"})
+    found = latest.marks(ECEF)
+    (mark,) = found["fixes"]
+    assert (mark["name"], mark["status"], len(mark["trail"])) == ("T", "ok", 3)
+    assert mark["trail"][-1] == mark["at"]
+    assert found["last"] <= found["now"]
+    assert latest.marks(ECEF)["fixes"][0] is mark  # only new fixes are computed
+    json.dumps(found, allow_nan=False)
+
+
+# Streams in the default two phases: the feeds carry the proven fix.
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 from optloc.cli import app
 from optloc.files import load
 from optloc.problem import InvalidProblem
-from optloc.service.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
+from optloc.service.answers import to_line
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import PENDING, Engine
 from optloc.service.events import Events
+from optloc.service.feeds import FORMATS, to_aircraft, to_feature, to_mark
 from optloc.service.messages import parse
 from optloc.service.metrics import COUNTS, Metrics
 from optloc.service.queues import WAITING, Ticket

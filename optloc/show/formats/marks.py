@@ -455,13 +455,14 @@ def geojson(results: Results) -> dict[str, Any]:
     rows = records(results.columns)
     for row, mark, area, known in zip(rows, results.marks(), results.areas(), results.known(), strict=True):
         about: dict[str, Any] = {name: row[name] for name in ("label", "number", "epoch", "target") if name in row}
+        sentence = {"sentence": mark.row.status_sentence}
         properties = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
         if mark.known:
-            features.append(feature(point_geometry(mark.place), {"role": "fix", **properties}))
+            features.append(feature(point_geometry(mark.place), {"role": "fix", **properties, **sentence}))
         if area is not None:
             features.append(feature(area.geometry, {"role": area.role, **({"cut": True} if area.cut else {}), **about}))
         for other in mark.others:
             doubt = {"gap": other.gap, "probability": other.probability}
             features.append(feature(point_geometry(other.place), {"role": "alternative", **about, **doubt}))
-        features += [feature(geometry, {**attributes, **about}) for geometry, attributes in known]
+        features += [feature(geometry, {**attributes, **about, **sentence}) for geometry, attributes in known]
     return {"type": "FeatureCollection", "features": features}

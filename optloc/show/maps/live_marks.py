@@ -11,7 +11,6 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.show.formats.marks import Mark, ellipse95
 from optloc.show.maps.map_marks import map_row
-from optloc.show.row_answer import use_rows
 
 # Decimals of a degree, and of a metre, in the feed: a tenth of a millimetre.
 _DEGREES, _METRES = 9, 4
@@ -39,13 +38,13 @@ def live_mark(frame: Frame, mark: Mark, trail: Sequence[Array] = ()) -> dict[str
     """
     source = mark.row
     row = map_row(frame, source.columns, source.number, mark.name, mark.time)
-    sentence = dict(use_rows(source.columns, source.number, source.sentence)).get("", "")
     texts = {name: getattr(row, name) for name in ("name", "time", "status", "look", "place", "copied", "size", "note")}
     axes = None
     if mark.covers:
         axes = list(ellipse95(mark.level))
     places = [_place(frame, position) for position in trail]
-    return {**texts, "sentence": sentence, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
+    texts["sentence"] = source.status_sentence
+    return {**texts, "at": _place(frame, mark.position), "ellipse": axes, "trail": places}
 
 
 def _place(frame: Frame, position: Array) -> list[float]:
