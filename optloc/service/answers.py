@@ -84,10 +84,10 @@ def _sentences(fix: Fix, *, pending: bool) -> list[str]:
 
 def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
     """Return the answer to an event without a position; `why` is its status, or an error, with other entries."""
-    record = {"event": _id_of(event), "phase": phase, **why, "position": None}
     if "status" in why:
         status = why["status"]
-        record["sentence"] = scan_sentence(status) if phase == "track" else _SENTENCES[status]
+        why["sentence"] = scan_sentence(status) if phase == "track" else _SENTENCES[status]
+    record = {"event": _id_of(event), "phase": phase, **why, "position": None}
     _add_exceptions(record, event)
     return record
 
