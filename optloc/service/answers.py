@@ -29,6 +29,7 @@ UNNAMED = "target"
 
 # The advice for an unproven fix of a file is wrong for a stream, whose proof is a second answer with a deadline.
 _PENDING = "The position is refined, but its proof is not finished, so another position is not excluded."
+_BEFORE_PROOF = {int(status): status.sentence for status in Status} | {int(Status.UNPROVEN): _PENDING}
 _GIVEN_UP = (
     "The position is refined, but its proof was given up, so another position is not excluded; raise '--deadline', or "
     "divide the events with '--partition'."
@@ -77,9 +78,9 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None, *, pending
 
 def _sentences(fix: Fix, *, pending: bool) -> list[str]:
     """Return the sentence of the status of each fix of a batch (n,); `pending` is whether proofs follow."""
-    sentences = np.asarray(fix.sentence)
-    found: list[str] = (np.where(fix.code == Status.UNPROVEN, _PENDING, sentences) if pending else sentences).tolist()
-    return found
+    if pending:
+        return [_BEFORE_PROOF[code] for code in fix.code.tolist()]
+    return np.ravel(fix.sentence).tolist()
 
 
 def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
