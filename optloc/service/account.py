@@ -67,7 +67,7 @@ class Account:
         with self._lock:
             return {source: dict(found) for source, found in self._counts.items()}
 
-    def stored(self, held: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    def for_checkpoint(self, held: Mapping[str, int]) -> dict[str, dict[str, int]]:
         """Return the counts for a checkpoint, in which only the lines `held` by the events of the checkpoint are open.
 
         Lines that wait in a queue are not in the checkpoint, so they do not count as received.

@@ -17,8 +17,6 @@ LOG = logging.getLogger("optloc.service")
 Adapter = Callable[[bytes], bytes]
 """Converts a line of another format to a line of a stream; it returns other lines unchanged, for an error message."""
 
-# Formats of other systems.
-
 
 class ChirpStack:
     """Adapter for uplinks of ChirpStack (version 4, JSON) from gateways with fine timestamps.
@@ -130,7 +128,7 @@ def adapter_of(name: str, stations: Collection[str]) -> Adapter:
     return ADAPTERS[name](stations)
 
 
-def converted(adapter: Adapter | None, data: bytes) -> tuple[bytes, str]:
+def convert(adapter: Adapter | None, data: bytes) -> tuple[bytes, str]:
     """Return a line in the form of a stream, and the error of the adapter if it fails; empty if not.
 
     An adapter reads data from a network, so any exception is an error of this line only.

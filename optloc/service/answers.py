@@ -14,7 +14,7 @@ import numpy as np
 
 from optloc.problem import PROOFS, UNKNOWN, Array, Fix, Problem, Status
 from optloc.service.events import Event
-from optloc.service.messages import shown_name
+from optloc.service.messages import name_keys
 from optloc.tracking import Entry, scan_sentence
 
 Record = dict[str, Any]
@@ -83,7 +83,7 @@ def _sentences(fix: Fix, *, pending: bool) -> list[str]:
     return np.ravel(fix.sentence).tolist()
 
 
-def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
+def unsolved_record(event: Event, phase: str = "fix", **why: Any) -> Record:
     """Return the answer to an event without a position; `why` is its status, or an error, with other entries."""
     if "status" in why:
         status = why["status"]
@@ -127,7 +127,7 @@ def _add_exceptions(record: Record, event: Event) -> None:
     if event.when is not None:
         record.setdefault("time", event.when * 1e-12)
     if _id_of(event) != event.name:
-        record |= shown_name(event.name)
+        record |= name_keys(event.name)
     if event.closed != "whole":
         record["closed"] = event.closed
     if event.revision > 1:
@@ -207,7 +207,7 @@ def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> R
     return record
 
 
-def unproven(event: Event, why: str, fix: Record, *, answered: bool) -> Record:
+def unproven_record(event: Event, why: str, fix: Record, *, answered: bool) -> Record:
     """Return the answer to an event whose proof was not finished.
 
     `why` is "deadline" or "skipped: load". `fix` is the answer of the first phase. With `answered`, it was already
@@ -221,7 +221,7 @@ def unproven(event: Event, why: str, fix: Record, *, answered: bool) -> Record:
         return fix | about
     about |= {"target": event.target} if event.target else {}
     about |= {"revision": event.revision} if event.revision > 1 else {}
-    return {**shown_name(event.name), "phase": "proof", **about}
+    return {**name_keys(event.name), "phase": "proof", **about}
 
 
 def join(first: Record | None, then: Record) -> Record:

@@ -12,7 +12,7 @@ from optloc.problem import InvalidProblem
 from optloc.service.account import SETTLED, STATES, total
 from optloc.service.answers import Record
 from optloc.service.events import Event, Events
-from optloc.service.messages import name_under, picoseconds, rows_and_arrivals, scoped_under
+from optloc.service.messages import full_name_under, name_under, picoseconds, rows_and_arrivals
 from optloc.service.metrics import COUNTS
 from optloc.service.site import Site
 
@@ -41,7 +41,7 @@ def state_of(events: Events, unwritten: Iterable[Event] = (), *, ended: bool = F
         waiting[event.name] = event
         lines.setdefault(event.name, Counter()).update(event.lines)
 
-    def spelled(event: Event) -> Record:
+    def record_of(event: Event) -> Record:
         """Return an event as JSON values: rows by kind and stations, arrivals by station in picoseconds as text."""
         rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
         times = [[site.stations[i], str(value)] for i, value in event.times.items()]
@@ -56,10 +56,10 @@ def state_of(events: Events, unwritten: Iterable[Event] = (), *, ended: bool = F
         "site": site.source,
         "ended": ended,
         "revision": events.revision,
-        "open": [spelled(event) for event in waiting.values()],
+        "open": [record_of(event) for event in waiting.values()],
         "closed": [name for name in events.closed if name not in waiting],
         "counts": dict(events.metrics.counts),
-        "account": events.metrics.account.stored(total(lines.values())),
+        "account": events.metrics.account.for_checkpoint(total(lines.values())),
     }
 
 
@@ -80,7 +80,7 @@ def restore(path: Path, events: Events, now: float) -> None:
         raise InvalidProblem("this is not a checkpoint of a stream", str(path), "use another file, or remove it")
     where = str(path)
     try:
-        closed = [scoped_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
+        closed = [full_name_under("closed", name) for name in _typed(found.get("closed"), list, "closed")]
         counts, account = _counts(found.get("counts")), _account(found.get("account", {}))
         ended = _typed(found.get("ended", False), bool, "ended")
         revision = _count(found.get("revision", 1), "revision") + (not ended)
@@ -123,7 +123,7 @@ def _event(found: Any, site: Site, now: float, taken: set[str]) -> Event:
     refused = _typed(each.get("refused", ""), str, "refused")
     if not rows and not times and not refused:
         raise InvalidProblem("an event has no rows", "rows", "remove the event")
-    name, target = scoped_under("event", each.get("event")), _typed(each.get("target"), str, "target")
+    name, target = full_name_under("event", each.get("event")), _typed(each.get("target"), str, "target")
     if name in taken:
         raise InvalidProblem(f"the event {name!r} occurs twice", "event", "remove one")
     event = Event(name, rows, times, now, now, sigmas, target and name_under("target", target))

@@ -149,17 +149,17 @@ def live(
 
     The rows of FILE are the template of an event. Signals: TERM answers all waiting events and ends, HUP reloads FILE.
     """
-    from optloc.service.process import ServiceOptions, run_stream
-
     stated = site_options(wave_speed, wind, two_way, turn_around, height)
     if check:
         raise typer.Exit(run_check(file, method, stated))
+    from optloc.service.process import ServiceOptions, run_stream
+
     settings = _settings(wait, late, phases, deadline, part, form)
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings |= {"state": state, "every": seconds_of(every, "--every"), "record": record}
-    speed = inf if speed is None else speed
     options = ServiceOptions(
-        settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq), stated=stated,
+        settings, method=method, recording=replay, speed=inf if speed is None else speed, shed=shed, quiet=quiet,
+        http=http, mqtt=mqtt, zmq=zmq, adapter=adapter, stdin=not (mqtt or zmq), stated=stated,
         access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
     raise typer.Exit(run_stream(file, options))
@@ -217,7 +217,8 @@ def serve(
     settings |= _tracking(model, filter_, noise, gap, track=track)
     settings |= {"state": state, "every": seconds_of(every, "--every"), "record": record}
     options = ServiceOptions(
-        settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False,
+        settings, method=method, shed=True, quiet=quiet,
+        http=http, mqtt=mqtt, zmq=zmq, adapter=adapter, stdin=False, stdout=False,
         stated=site_options(wave_speed, wind, two_way, turn_around, height),
         access=access_of(hosts or (), token_file, without_token=no_token),
     )  # fmt: skip
@@ -252,11 +253,11 @@ def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, 
     if (model, name, noise, gap) == ("cv", "iekf", None, None):
         return {"track": track}
     from optloc.cli import TrackOptions, dynamics_of, rules
-    from optloc.service.tracks import Following
+    from optloc.service.tracks import TrackSettings
     from optloc.tracking import Rules, filter_of
 
     dynamics = dynamics_of(TrackOptions(model, noise=noise))
-    return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}
+    return {"track": track, "track_settings": TrackSettings(dynamics, filter_of(name), rules(Rules().gate, gap))}
 
 
 def site_options(
@@ -289,15 +290,15 @@ def input_description(site: Site) -> Iterator[str]:
     row = site.rows[0]
     ends = {key: value for key, value in (("a", row.a), ("b", row.b)) if value}
     yield "single rows: " + json.dumps({"event": "1", "kind": row.kind, **ends, "z": 0.0})
-    if site.arriving:
-        line = {"event": "1", "station": site.stations[site.hearing[0]], "time_ns": 1_700_000_000_000_000_000}
+    if site.arrival_rows:
+        line = {"event": "1", "station": site.stations[site.arrival_stations[0]], "time_ns": 1_700_000_000_000_000_000}
         yield "arrivals: " + json.dumps(line)
     listed = ", ".join(site.name_of(i) for i in range(min(len(site.rows), 12)))
     yield f"z is: {listed}" + (" ..." if len(site.rows) > 12 else "")
     yield "an event is whole with " + (
-        f"the arrivals of {', '.join(site.stations[i] for i in site.hearing[:12])}"
-        + (" ..." if len(site.hearing) > 12 else "")
-        if site.arriving and not site.others
+        f"the arrivals of {', '.join(site.stations[i] for i in site.arrival_stations[:12])}"
+        + (" ..." if len(site.arrival_stations) > 12 else "")
+        if site.arrival_rows and not site.other_rows
         else f"all {len(site.rows)} rows"
     )
 

@@ -118,10 +118,10 @@ def _line_endpoints(stream: Stream) -> list[Endpoint]:
         return await _answer(stream, request, track=False)
 
     async def track(request: Any) -> Any:
-        return _untracked(stream) or await _answer(stream, request, track=True)
+        return _refusal_of_tracks(stream) or await _answer(stream, request, track=True)
 
     async def tracks(_: Any) -> Any:
-        return _untracked(stream) or _json({"tracks": stream.tracks.records()})
+        return _refusal_of_tracks(stream) or _json({"tracks": stream.tracks.records()})
 
     async def one_track(request: Any) -> Any:
         name = request.path_params["target"]
@@ -140,18 +140,16 @@ def _line_endpoints(stream: Stream) -> list[Endpoint]:
     ]
 
 
-def _untracked(stream: Stream) -> Any:
+def _refusal_of_tracks(stream: Stream) -> Any:
     """Return a refusal if a stream cannot make tracks; None if it can."""
-    return _refused(400, stream.untracked) if stream.untracked else None
+    return _refused(400, stream.track_refusal) if stream.track_refusal else None
 
 
 def page_of(site: Site) -> str:
     """Return the page with the map of a site; raise InvalidProblem if no station has a position on the map."""
     from optloc.show import live_page
 
-    ready = site.ready((), site.rows)
-    assert ready is not None  # a site has rows
-    return live_page(ready.fast.problem, site.title)
+    return live_page(site.whole.fast.problem, site.title)
 
 
 # Lines.

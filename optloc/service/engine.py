@@ -19,11 +19,11 @@ import numpy as np
 from optloc.engine import simulate
 from optloc.model_checks import refuse_impossible, suspicious_values
 from optloc.problem import Array, InvalidProblem, Status
-from optloc.service.answers import Record, fix_records, proof_records, unproven, unsolved
+from optloc.service.answers import Record, fix_records, proof_records, unproven_record, unsolved_record
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics
 from optloc.service.site import Ready, Site, SiteRow
-from optloc.service.tracks import Following, Scan, Tracks
+from optloc.service.tracks import Scan, Tracks, TrackSettings
 from optloc.solvers import PreparedFloors
 
 LOG = logging.getLogger("optloc.service")
@@ -89,7 +89,7 @@ class Engine:
         Seconds from the closing of an event to the end of its proof; infinity for no deadline.
     shed : bool
         Whether events are answered without a proof if too many wait; otherwise the stream waits.
-    following : Following, optional
+    track_settings : TrackSettings, optional
         Settings of tracks.
     """
 
@@ -103,7 +103,7 @@ class Engine:
         phases: str = "two",
         deadline: float = inf,
         shed: bool = True,
-        following: Following | None = None,
+        track_settings: TrackSettings | None = None,
     ) -> None:
         self.site, self._metrics, self._emit, self._clock = site, metrics, emit, clock
         self._phases, self._deadline, self._shed = phases, deadline, shed
@@ -113,10 +113,9 @@ class Engine:
         self._changed, self._ends = Condition(), False
         self._thread = Thread(target=self._prove, name="optloc proofs", daemon=True)
         self._to_check, self._warned = _CHECKED, set[str]()
-        ready = site.ready((), site.rows)
-        assert ready is not None  # a site has rows
-        self._untrackable = _ON_FLOORS if isinstance(ready.fast, PreparedFloors) else ""
-        self.tracks = Tracks(ready.fast.problem, following or Following(), metrics, self._followed, clock)
+        first = site.whole.fast
+        self._untrackable = _ON_FLOORS if isinstance(first, PreparedFloors) else ""
+        self.tracks = Tracks(first.problem, track_settings or TrackSettings(), metrics, self._answer_scan, clock)
         metrics.gauges["proofs"] = lambda: len(self._waiting)
         if phases != "fix":
             self._thread.start()
@@ -127,43 +126,25 @@ class Engine:
         with self._changed:
             return self._open[0].until if self._open else inf
 
-    def settle(self, events: Iterable[Event]) -> None:
+    def solve(self, events: Iterable[Event]) -> None:
         """Answer closed events with fixes and queue their proofs; pass events of tracks to their tracks.
 
         An event with an error is answered by its error. With the phases "one", an event is answered after its proof
         only.
         """
-        closed = []
+        closed, tracked = list[Event](), list[Event]()
         for event in events:
             refused = event.refused or (self._untrackable if event.track else "")
             if refused:
-                self._fail(event, refused)
+                self._answer_error(event, refused)
             else:
-                closed.append(event)
-        followed = [event for event in closed if event.track]
-        if followed:
-            scans = [Scan(e, group.ready.fast.problem, z) for group in self._groups(followed) for e, z in _pairs(group)]
-            # groups are by rows, but tracks need the order of time
-            place = {id(event): i for i, event in enumerate(followed)}
-            self.tracks.take(sorted(scans, key=lambda scan: place[id(scan.event)]))
-            closed = [event for event in closed if not event.track]
+                (tracked if event.track else closed).append(event)
+        self._follow(tracked)
         for group in self._groups(closed):
             if self._phases == "one":
-                self._offer([Pending(e, group.ready, z, None, e.stamp + self._deadline) for e, z in _pairs(group)])
-                continue
-            last = self._phases == "fix"
-            records = self._fixed(group, "fix", pending=not last)
-            self._metrics.took("fix", [self._clock() - event.stamp for event in group.events])
-            for event, record in zip(group.events, records, strict=True):
-                self._answer(event, record, last or "error" in record)
-            if not last:
-                found = zip(_pairs(group), records, strict=True)
-                items = [
-                    Pending(e, group.ready, z, record, e.stamp + self._deadline)
-                    for (e, z), record in found
-                    if "error" not in record
-                ]
-                self._offer(items)
+                self._offer(self._proofs_of(group, [None] * len(group.events)))
+            else:
+                self._answer_fixes(group)
 
     def expire(self) -> None:
         """Answer the events whose proofs have passed their deadlines."""
@@ -209,6 +190,35 @@ class Engine:
 
     # Batches.
 
+    def _follow(self, events: Sequence[Event]) -> None:
+        """Pass events of tracks to their tracks, in the order in which they closed."""
+        scans = [Scan(e, group.ready.fast.problem, z) for group in self._groups(events) for e, z in _pairs(group)]
+        # groups are by rows, but tracks need the order of time
+        place = {id(event): i for i, event in enumerate(events)}
+        if scans:
+            self.tracks.take(sorted(scans, key=lambda scan: place[id(scan.event)]))
+
+    def _answer_fixes(self, group: EventGroup) -> None:
+        """Answer the events of a group with fixes, and queue their proofs unless no proofs are wanted."""
+        last = self._phases == "fix"
+        records = self._first_records(group, "fix", pending=not last)
+        self._metrics.note_latency("fix", [self._clock() - event.stamp for event in group.events])
+        for event, record in zip(group.events, records, strict=True):
+            self._answer(event, record, last or "error" in record)
+        if not last:
+            self._offer(self._proofs_of(group, records))
+
+    def _proofs_of(self, group: EventGroup, records: Sequence[Record | None]) -> list[Pending]:
+        """Return the proofs of the events of a group; `records` has the answers of the first phase, or None.
+
+        An event whose first answer is an error has no proof.
+        """
+        return [
+            Pending(event, group.ready, z, record, event.stamp + self._deadline)
+            for (event, z), record in zip(_pairs(group), records, strict=True)
+            if record is None or "error" not in record
+        ]
+
     def _groups(self, events: Iterable[Event]) -> list[EventGroup]:
         """Return events grouped by rows; answer events whose rows give no problem at once."""
         found: dict[tuple[tuple[int, ...], tuple[SiteRow, ...]], list[Event]] = {}
@@ -237,17 +247,17 @@ class Engine:
         """
         receivers, rows = key
         now = self._clock()
-        self._metrics.hear((self.site.stations[i] for i in receivers), now)
-        self._metrics.hear((name for row in rows for name in (row.a, row.b) if name), now)
+        self._metrics.note_rows((self.site.stations[i] for i in receivers), now)
+        self._metrics.note_rows((name for row in rows for name in (row.a, row.b) if name), now)
         try:
             ready = self.site.ready(receivers, rows)
         except InvalidProblem as error:
             for event in events:
-                self._fail(event, str(error))
+                self._answer_error(event, str(error))
             return []
         if ready is None:
             for event in events:
-                self._answer(event, unsolved(event, status=Status.TOO_FEW_ROWS.label), last=True)
+                self._answer(event, unsolved_record(event, status=Status.TOO_FEW_ROWS.label), last=True)
             return []
         # differences of integers: a float of seconds since 1970 only resolves 70 m
         arrivals = np.array([_since_first(event, receivers) for event in events], dtype=float).reshape(len(events), -1)
@@ -262,7 +272,7 @@ class Engine:
             try:
                 refuse_impossible(problem.with_rows(z=group.z[i]), lambda _: self.site.source, "live")
             except InvalidProblem as error:
-                self._fail(group.events[i], str(error))
+                self._answer_error(group.events[i], str(error))
         kept = np.flatnonzero(~bad).tolist()
         if bad.any():
             group = EventGroup(ready, [group.events[i] for i in kept], group.z[kept])
@@ -274,33 +284,33 @@ class Engine:
                 LOG.warning("%s: %s; %s", self.site.source, one.seen, one.advice)
         return [group] if kept else []
 
-    def _fixed(self, group: EventGroup, phase: str | None, *, pending: bool = False) -> list[Record]:
+    def _first_records(self, group: EventGroup, phase: str | None, *, pending: bool = False) -> list[Record]:
         """Return the answers of the first phase (n), as `fix_records`; if the solver fails, each has the error."""
         try:
             return fix_records(group.ready.fast(group.z), group.events, phase, pending=pending)
         except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
-            return self._failed(group, error)
+            return self._error_records(group, error)
 
-    def _failed(self, group: EventGroup, error: Exception) -> list[Record]:
+    def _error_records(self, group: EventGroup, error: Exception) -> list[Record]:
         """Return answers with an error for all events of a group, and log errors that are not errors of the input."""
         if not isinstance(error, InvalidProblem):
             LOG.error("events failed, from %s on", group.events[0].name, exc_info=error)
         why = str(error) if isinstance(error, InvalidProblem) else f"{type(error).__name__}: {error}"
         self._metrics.add("unsolvable", len(group.events))
-        return [unsolved(event, error=why) for event in group.events]
+        return [unsolved_record(event, error=why) for event in group.events]
 
-    def _fail(self, event: Event, why: str) -> None:
+    def _answer_error(self, event: Event, why: str) -> None:
         """Answer an event with the error `why`, and count it."""
         self._metrics.add("unsolvable")
-        self._answer(event, unsolved(event, phase="track" if event.track else "fix", error=why), last=True)
+        self._answer(event, unsolved_record(event, phase="track" if event.track else "fix", error=why), last=True)
 
     def _answer(self, event: Event, record: Record, last: bool) -> None:
         """Send an answer of an event; with `last`, count its status and its proof."""
         if last:
-            self._metrics.concluded(record.get("status", "error"), record.get("proof"))
+            self._metrics.count_event(record.get("status", "error"), record.get("proof"))
         self._emit(event, record, last)
 
-    def _followed(self, event: Event, record: Record) -> None:
+    def _answer_scan(self, event: Event, record: Record) -> None:
         """Send the answer of a track, which is the only answer of its event."""
         self._emit(event, record, True)
 
@@ -326,13 +336,13 @@ class Engine:
         Events without an answer of the first phase are fixed now.
         """
         self._metrics.add("overdue" if why == "deadline" else "skipped", len(items))
-        for group in _grouped([item for item in items if item.before is None]):
-            for event, record in zip(group.events, self._fixed(group, None), strict=True):
-                whole = record if "error" in record else unproven(event, why, record, answered=False)
+        for group in _proof_groups([item for item in items if item.before is None]):
+            for event, record in zip(group.events, self._first_records(group, None), strict=True):
+                whole = record if "error" in record else unproven_record(event, why, record, answered=False)
                 self._answer(event, whole, last=True)
         for item in items:
             if item.before is not None:
-                self._answer(item.event, unproven(item.event, why, item.before, answered=True), last=True)
+                self._answer(item.event, unproven_record(item.event, why, item.before, answered=True), last=True)
 
     def _prove(self) -> None:
         """Compute the waiting proofs in batches until the engine ends (the second thread)."""
@@ -343,7 +353,7 @@ class Engine:
                     return
                 taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), BATCH))]
                 self._changed.notify_all()
-            for group in _grouped([item for item in taken if not item.done]):
+            for group in _proof_groups([item for item in taken if not item.done]):
                 try:
                     self._conclude(group, {id(item.event): item for item in taken})
                 except Exception:  # an answer that cannot be passed on must not end all proofs
@@ -353,15 +363,14 @@ class Engine:
         """Prove the fixes of events, and answer the events that are still open.
 
         `items` has the pending proofs by the identity of the event, since late rows may have given an event of the same
-        name. Events that passed their deadline meanwhile have their
-        last answer, so their proofs are dropped.
+        name. Events that passed their deadline meanwhile have their last answer, so their proofs are dropped.
         """
         pending = [items[id(event)] for event in group.events]
         try:
             fix = group.ready.full(group.z)
             records = proof_records(fix, group.events, [item.before for item in pending])
         except Exception as error:  # noqa: BLE001  # as in the first phase
-            records = self._failed(group, error)
+            records = self._error_records(group, error)
         answered = []
         with self._changed:
             for item, record in zip(pending, records, strict=True):
@@ -370,7 +379,7 @@ class Engine:
                     answered.append((item.event, record))
             while self._open and self._open[0].done:
                 self._open.popleft()
-        self._metrics.took("proof", [self._clock() - event.stamp for event, _ in answered])
+        self._metrics.note_latency("proof", [self._clock() - event.stamp for event, _ in answered])
         for event, record in answered:
             self._answer(event, record, last=True)
 
@@ -380,8 +389,7 @@ def warm_up(site: Site, phases: str) -> None:
 
     `phases` are the phases of the answers: "two", "one" or "fix".
     """
-    ready = site.ready((), site.rows)
-    assert ready is not None  # a site has rows
+    ready = site.whole
     problem = ready.fast.problem
     x = np.zeros(problem.layout.size)
     slot, _ = problem.layout.find("position")
@@ -412,7 +420,7 @@ def _pairs(group: EventGroup) -> list[tuple[Event, Array]]:
     return list(zip(group.events, group.z, strict=True))
 
 
-def _grouped(items: Sequence[Pending]) -> list[EventGroup]:
+def _proof_groups(items: Sequence[Pending]) -> list[EventGroup]:
     """Return proofs grouped by prepared problem."""
     found: dict[int, list[Pending]] = {}
     for item in items:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from zlib import crc32
 
 from optloc.problem import InvalidProblem
-from optloc.service.messages import Key, Message, shown_name
+from optloc.service.messages import Key, Message, name_keys
 from optloc.service.metrics import Metrics
 from optloc.service.site import Site, UnknownName
 
@@ -37,7 +37,7 @@ class RefusedRepeat(InvalidProblem):
 
     def __init__(self, what: str, name: str, code: int) -> None:
         advice = {OTHER: "use another id, or name the client", GONE: "use another id"}[code]
-        super().__init__(what, f"event {shown_name(name)['event'][:40]!r}", advice)
+        super().__init__(what, f"event {name_keys(name)['event'][:40]!r}", advice)
         self.name, self.code = name, code
 
 
@@ -58,7 +58,7 @@ class Event:
     Parameters
     ----------
     name : str
-        Id of the event, as in `optloc.service.messages.scoped`.
+        Id of the event, as in `optloc.service.messages.full_name`.
     rows, times, sigmas, target
         As in `Message`.
     first : float
@@ -178,19 +178,19 @@ class Events:
         event = self.open.get(message.event)
         if event is None:
             if message.event in self.closed:
-                return self._after(message, now, reply, track=track)
+                return self._take_late(message, now, reply, track=track)
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
             event.when, event.track, event.revision = message.when, track, self.revision
-            self._wait_for(event, reply)
+            self._attach_reply(event, reply)
             if message.whole:
                 self._close(event, "whole", now)
                 return event
             self._open(event, now)
         else:
             if reply is not None:
-                self._refuse_other(event, message, track=track)
+                self._refuse_other_values(event, message, track=track)
             self._join(event, message)
-            self._wait_for(event, reply)
+            self._attach_reply(event, reply)
         if message.whole or self._is_whole(event):
             self.open.pop(event.name, None)
             self._close(event, "whole", now)
@@ -277,17 +277,17 @@ class Events:
         """
         site = self.site
         if event.times:
-            if len(event.times) < len(site.hearing):
+            if len(event.times) < len(site.arrival_stations):
                 return False
-            return all(i in event.rows for i in site.others)
+            return all(i in event.rows for i in site.other_rows)
         return len(event.rows) >= len(site.rows) and all(i in event.rows for i in range(len(site.rows)))
 
-    def _wait_for(self, event: Event, reply: Reply | None) -> None:
+    def _attach_reply(self, event: Event, reply: Reply | None) -> None:
         """Give the event a receiver of its answers, if there is one; raise RefusedRepeat if its answer is gone."""
         if reply is not None and not self.attach(event, reply):
             raise RefusedRepeat("its answer is no longer kept", event.name, GONE)
 
-    def _refuse_other(self, event: Event, message: Message, *, track: bool) -> None:
+    def _refuse_other_values(self, event: Event, message: Message, *, track: bool) -> None:
         """Raise RefusedRepeat if a line has other values than the event of its id."""
         other = self._differing(event, message)
         self.metrics.counts["conflicts"] += len(other)
@@ -327,7 +327,7 @@ class Events:
         if len(self._order) > REMEMBERED:
             self.closed.pop(self._order.popleft(), None)
 
-    def _after(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
+    def _take_late(self, message: Message, now: float, reply: Reply | None, *, track: bool) -> Event | str:
         """Handle rows that arrive after their event has closed: count them, send notes, or answer again.
 
         A receiver gets the answer of the event; a line with other rows or values is refused. The result is as
@@ -340,7 +340,7 @@ class Events:
                 raise RefusedRepeat("its answer is no longer kept", message.event, GONE)
             return "answered"
         if reply is not None:
-            self._refuse_other(event, message, track=track)
+            self._refuse_other_values(event, message, track=track)
         site = self.site
         late = [site.name_of(key) for key in message.rows if key not in event.rows]
         late += [site.stations[i] for i in message.times if i not in event.times]
@@ -349,24 +349,33 @@ class Events:
         counts["repeated"] += len(message.rows) + len(message.times) - len(late) - len(other)
         counts["late"] += len(late)
         if other:
-            self.note({**shown_name(event.name), "note": "conflict", "rows": other})
+            self.note({**name_keys(event.name), "note": "conflict", "rows": other})
         if late and not self.revise:
-            self.note({**shown_name(event.name), "note": "late", "rows": late})
+            self.note({**name_keys(event.name), "note": "late", "rows": late})
             if reply is not None:
                 raise RefusedRepeat(f"it is answered without {', '.join(late[:3])}", event.name, OTHER)
         if late and self.revise:
             again = Event(
-                event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
-                {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
-                "late", event.revision + 1, event.conflict or bool(other), when=event.when, track=event.track,
+                name=event.name,
+                rows={**message.rows, **event.rows},
+                times={**message.times, **event.times},
+                first=now,
+                stamp=now,
+                sigmas={**(message.sigmas or {}), **event.sigmas},
+                target=event.target or message.target,
+                closed="late",
+                revision=event.revision + 1,
+                conflict=event.conflict or bool(other),
+                when=event.when,
+                track=event.track,
                 refused=event.refused,
-            )  # fmt: skip
+            )
             counts["revisions"] += 1
             self.closed[event.name] = again
             self.ready.append(again)
-            self._wait_for(again, reply)
+            self._attach_reply(again, reply)
             return again
-        self._wait_for(event, reply)
+        self._attach_reply(event, reply)
         return "dropped" if late or other else "answered"
 
 

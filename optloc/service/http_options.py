@@ -58,13 +58,13 @@ class AccessRules:
         Permitted host names in lower case, in addition to names and addresses that no stranger can choose.
     tokens : tuple of bytes
         SHA-256 digests of the permitted tokens; empty if requests need no token.
-    open : bool
+    without_token : bool
         Whether other machines may send requests without a token.
     """
 
     hosts: tuple[str, ...] = ()
     tokens: tuple[bytes, ...] = ()
-    open: bool = False
+    without_token: bool = False
 
 
 def access_of(hosts: Iterable[str], token_file: Path | None, *, without_token: bool = False) -> AccessRules:

@@ -44,7 +44,7 @@ class Message(NamedTuple):
     Parameters
     ----------
     event : str
-        Event of the rows, as in `scoped`; empty for a command.
+        Event of the rows, as in `full_name`; empty for a command.
     rows : dict of Key to float
         Values in the units of the site.
     times : dict of int to int
@@ -86,7 +86,7 @@ def parse(line: bytes, site: Site) -> Message:
     station, time = found.get("station"), found.get("time_ns")
     if len(found) == 3 and type(time) is int and abs(time) < _LATEST // 1000 and type(station) is str:
         number = site.number.get(station, -1)  # the most frequent form of arrivals
-        if number >= 0 and site.arriving:
+        if number >= 0 and site.arrival_rows:
             return Message(_event(found), {}, {number: 1000 * time}, whole=False)
     return _general(found, site)
 
@@ -102,7 +102,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
         if command not in COMMANDS:
             raise InvalidProblem(f"unknown command {str(command)[:40]!r}", "command", f"use {' or '.join(COMMANDS)}")
         return Message("", {}, {}, whole=False, command=command)
-    event = scoped(_text(found["client"], "client") if "client" in found else "", _event(found))
+    event = full_name(_text(found["client"], "client") if "client" in found else "", _event(found))
     target = _text(found["target"], "target") if "target" in found else ""
     forms: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
     forms += ["z"] if "z" in found and "kind" not in found else []
@@ -120,7 +120,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, forms))
 
 
-def stamped(data: bytes, received: float) -> bytes:
+def with_reading_time(data: bytes, received: float) -> bytes:
     """Return a valid line with its time of reading, s, as the first key: the form of a recording."""
     if b'"received"' in data:  # a line of a recording that is read again
         found = read_object(data, LINE)
@@ -140,12 +140,12 @@ def of_client(line: bytes, client: str | None) -> bytes:
 # Clients may use the same ids. A line feed joins client and id, because no name may contain one.
 
 
-def scoped(client: str, event: str) -> str:
+def full_name(client: str, event: str) -> str:
     """Return the name of an event of a client within a stream; the id itself without a client."""
     return f"{client}\n{event}" if client else event
 
 
-def shown_name(name: str) -> dict[str, str]:
+def name_keys(name: str) -> dict[str, str]:
     """Return the keys of an event for answers: its id, and its client if it has one."""
     client, _, event = name.rpartition("\n")
     return {"event": event, "client": client} if client else {"event": event}
@@ -272,7 +272,7 @@ def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> Non
     `found` is the entry of the arrival. Raise InvalidProblem for an invalid entry, or for a second time of a station.
     """
     station = found.get("station")
-    if not site.arriving:
+    if not site.arrival_rows:
         what = "the site has neither toa nor tdoa rows, so it cannot use arrivals"
         raise InvalidProblem(what, "station", "send values: kind, a, b, z")
     if type(station) is not str or station not in site.number:
@@ -302,11 +302,11 @@ def name_under(key: str, given: Any) -> str:
     return _text(given, key)
 
 
-def scoped_under(key: str, given: Any) -> str:
-    """Return the name of an event under a key, as `scoped` returns it; raise InvalidProblem for an invalid name."""
+def full_name_under(key: str, given: Any) -> str:
+    """Return the name of an event under a key, as `full_name` returns it; raise InvalidProblem for an invalid name."""
     parts = given.split("\n") if type(given) is str else [given]
     if len(parts) == 2:
-        return scoped(_text(parts[0], key), _text(parts[1], key))
+        return full_name(_text(parts[0], key), _text(parts[1], key))
     return _text(given, key)
 
 

@@ -47,12 +47,22 @@ COUNTS = {
 class Metrics:
     """Counters and latencies of one stream; thread-safe.
 
-    counts: counts by the names in `COUNTS`. statuses: number of last answers by status. proofs: number of proofs by
-    outcome. tracks: number of events of tracks by status. heard: time of the last row of each station by the clock of
-    the stream, s. gauges: functions that return the present length of each queue. account: lines by source and state.
-    alarms: functions that return the alarm of each part, by the kind of the part ("source" or "output") and its name.
-    restarts: functions that return the number of restarts of each source. losses: functions that return the number of
-    dropped entries of each side output.
+    Attributes
+    ----------
+    counts : Counter of str
+        Counts by the names in `COUNTS`.
+    statuses, proofs, tracks : Counter of str
+        Numbers of last answers by status, of proofs by outcome, and of events of tracks by status.
+    last_row : dict of str to float
+        Time of the last row of each station, by the clock of the stream, s.
+    gauges : dict of str to callable
+        Functions that return the present length of each queue.
+    account : Account
+        Lines by source and state.
+    alarms : dict of (str, str) to callable
+        Functions that return the alarm of each part, by its kind ("source", "output" or "account") and its name.
+    restarts, losses : dict of str to callable
+        Functions that return the number of restarts of each source, and of dropped entries of each side output.
     """
 
     def __init__(self) -> None:
@@ -64,7 +74,7 @@ class Metrics:
         # the latest latencies of each phase, s: a new value replaces the oldest; `_answers` counts all values
         self._latency = {phase: np.zeros(_LATENCIES) for phase in PHASES}
         self._answers: Counter[str] = Counter()
-        self.heard: dict[str, float] = {}
+        self.last_row: dict[str, float] = {}
         self.gauges: dict[str, Callable[[], int]] = {}
         self.account = Account()
         self.alarms: dict[tuple[str, str], Callable[[], Alarm | None]] = {}
@@ -76,7 +86,7 @@ class Metrics:
         with self._lock:
             self.counts[name] += count
 
-    def took(self, phase: str, seconds: Sequence[float]) -> None:
+    def note_latency(self, phase: str, seconds: Sequence[float]) -> None:
         """Store the latencies of answers of a phase, one of `PHASES`: seconds from the last row of their events."""
         taken = np.asarray(seconds, dtype=float)
         with self._lock:
@@ -84,22 +94,22 @@ class Metrics:
             self._latency[phase][place] = taken
             self._answers[phase] += len(taken)
 
-    def concluded(self, status: str, proof: str | None) -> None:
+    def count_event(self, status: str, proof: str | None) -> None:
         """Count an event by its status, and by its proof if it has one."""
         with self._lock:
             self.statuses[status] += 1
             if proof is not None:
                 self.proofs[proof] += 1
 
-    def followed(self, status: str) -> None:
+    def count_scan(self, status: str) -> None:
         """Count an event of a track by its status."""
         with self._lock:
             self.tracks[status] += 1
 
-    def hear(self, stations: Iterable[str], now: float) -> None:
+    def note_rows(self, stations: Iterable[str], now: float) -> None:
         """Store the time of the last row of stations, by the clock of the stream."""
         for name in stations:
-            self.heard[name] = now
+            self.last_row[name] = now
 
     def percentiles(self, phase: str) -> Array:
         """Return the median and the 99th percentile of the latest latencies of a phase, seconds; NaN without any."""
@@ -108,7 +118,7 @@ class Metrics:
             values = self._latency[phase][:count].copy()
         return np.quantile(values, [0.5, 0.99]) if count else np.full(2, np.nan)
 
-    def active(self, now: float) -> list[dict[str, Any]]:
+    def active_alarms(self, now: float) -> list[dict[str, Any]]:
         """Return the present alarms: kind and name of the part, its error, and the seconds since which it fails."""
         found = [(kind, name, alarm()) for (kind, name), alarm in list(self.alarms.items())]
         return [
@@ -130,13 +140,13 @@ class Metrics:
                 "proofs": dict(self.proofs),
                 "tracks": dict(self.tracks),
             }
-        out["account"], out["alarms"] = self.account.records(), self.active(now)
+        out["account"], out["alarms"] = self.account.records(), self.active_alarms(now)
         out["dropped_by_output"] = {name: count() for name, count in list(self.losses.items())}
         out["queues"] = {name: depth() for name, depth in self.gauges.items()}
         for phase in PHASES:
             p50, p99 = self.percentiles(phase)
             out[f"{phase}_latency_ms"] = None if np.isnan(p50) else {"p50": _ms(p50), "p99": _ms(p99)}
-        out["seconds_since_row"] = {name: round(now - when, 3) for name, when in sorted(self.heard.items())}
+        out["seconds_since_row"] = {name: round(now - when, 3) for name, when in sorted(self.last_row.items())}
         return out
 
     def text(self, now: float) -> str:
@@ -144,75 +154,65 @@ class Metrics:
         found = self.health(now, {})
         lines = []
         for name, meaning in COUNTS.items():
-            lines += [f"# HELP optloc_{name}_total {meaning}", f"# TYPE optloc_{name}_total counter"]
-            lines.append(f"optloc_{name}_total {found[name]}")
-        for name, key, meaning in (
-            ("fixes_total", "statuses", "fixes by status"),
-            ("proofs_total", "proofs", "proofs by outcome"),
-            ("tracks_total", "tracks", "events of tracks by status"),
+            lines += _family(f"{name}_total", "counter", meaning, [({}, found[name])])
+        for name, key, label, meaning in (
+            ("fixes_total", "statuses", "status", "fixes by status"),
+            ("proofs_total", "proofs", "proof", "proofs by outcome"),
+            ("tracks_total", "tracks", "status", "events of tracks by status"),
         ):
-            label = "proof" if key == "proofs" else "status"
-            lines += [f"# HELP optloc_{name} {meaning}", f"# TYPE optloc_{name} counter"]
-            lines += [f'optloc_{name}{{{label}="{_label(word)}"}} {n}' for word, n in sorted(found[key].items())]
+            lines += _family(name, "counter", meaning, [({label: word}, n) for word, n in sorted(found[key].items())])
         lines += self._account_text(found["account"]) + self._alarm_text(found)
-        lines += ["# HELP optloc_queue_depth waiting entries", "# TYPE optloc_queue_depth gauge"]
-        lines += [f'optloc_queue_depth{{queue="{name}"}} {depth}' for name, depth in found["queues"].items()]
-        lines += [
-            "# HELP optloc_latency_seconds time from the last row to the answer",
-            "# TYPE optloc_latency_seconds gauge",
+        depths = [({"queue": name}, depth) for name, depth in found["queues"].items()]
+        lines += _family("queue_depth", "gauge", "waiting entries", depths)
+        latencies = [
+            ({"phase": phase, "quantile": quantile}, f"{value:.6g}")
+            for phase in PHASES
+            if self._answers[phase]
+            for quantile, value in zip(("0.5", "0.99"), self.percentiles(phase), strict=True)
         ]
-        for phase in PHASES:
-            if not self._answers[phase]:
-                continue
-            for word, value in zip(("0.5", "0.99"), self.percentiles(phase), strict=True):
-                lines.append(f'optloc_latency_seconds{{phase="{phase}",quantile="{word}"}} {value:.6g}')
-        lines += [
-            "# HELP optloc_silence_seconds time since the last row of a station",
-            "# TYPE optloc_silence_seconds gauge",
-        ]
-        lines += [
-            f'optloc_silence_seconds{{station="{_label(name)}"}} {seconds}'
-            for name, seconds in found["seconds_since_row"].items()
-        ]
+        lines += _family("latency_seconds", "gauge", "time from the last row to the answer", latencies)
+        silence = [({"station": name}, seconds) for name, seconds in found["seconds_since_row"].items()]
+        lines += _family("silence_seconds", "gauge", "time since the last row of a station", silence)
         return "\n".join(lines) + "\n"
 
     def _account_text(self, account: Mapping[str, Mapping[str, int]]) -> list[str]:
         """Return the account in the text format of Prometheus."""
-        lines = [
-            "# HELP optloc_source_lines_total lines by source; received = answered + refused + dropped + open",
-            "# TYPE optloc_source_lines_total counter",
+        sources = sorted(account.items())
+        settled = [
+            ({"source": name, "state": state}, counts[state])
+            for name, counts in sources
+            for state in ("received", *SETTLED)
         ]
-        for source, counts in sorted(account.items()):
-            for state in ("received", *SETTLED):
-                labels = f'source="{_label(source)}",state="{state}"'
-                lines.append(f"optloc_source_lines_total{{{labels}}} {counts[state]}")
-        lines += ["# HELP optloc_open_lines lines that wait for their answers", "# TYPE optloc_open_lines gauge"]
-        lines += [
-            f'optloc_open_lines{{source="{_label(source)}"}} {n["open"]}' for source, n in sorted(account.items())
+        waiting = [({"source": name}, counts["open"]) for name, counts in sources]
+        meaning = "lines by source; received = answered + refused + dropped + open"
+        return [
+            *_family("source_lines_total", "counter", meaning, settled),
+            *_family("open_lines", "gauge", "lines that wait for their answers", waiting),
         ]
-        return lines
 
     def _alarm_text(self, found: Mapping[str, Any]) -> list[str]:
         """Return alarms, restarts and losses of outputs in the text format of Prometheus; `found` is the health."""
         active = {(each["part"], each["name"]) for each in found["alarms"]}
-        lines = ["# HELP optloc_alarm 1 if a part does not work", "# TYPE optloc_alarm gauge"]
-        lines += [
-            f'optloc_alarm{{part="{part}",name="{_label(name)}"}} {int((part, name) in active)}'
-            for part, name in sorted(self.alarms)
+        alarms = [({"part": part, "name": name}, int((part, name) in active)) for part, name in sorted(self.alarms)]
+        restarts = [({"source": name}, count()) for name, count in sorted(self.restarts.items())]
+        losses = [({"output": name}, count) for name, count in sorted(found["dropped_by_output"].items())]
+        return [
+            *_family("alarm", "gauge", "1 if a part does not work", alarms),
+            *_family("restarts_total", "counter", "restarts of a source", restarts),
+            *_family("output_dropped_total", "counter", "entries that a side output dropped", losses),
         ]
-        lines += ["# HELP optloc_restarts_total restarts of a source", "# TYPE optloc_restarts_total counter"]
-        lines += [
-            f'optloc_restarts_total{{source="{_label(name)}"}} {n()}' for name, n in sorted(self.restarts.items())
-        ]
-        lines += [
-            "# HELP optloc_output_dropped_total entries that a side output dropped",
-            "# TYPE optloc_output_dropped_total counter",
-        ]
-        lines += [
-            f'optloc_output_dropped_total{{output="{_label(name)}"}} {count}'
-            for name, count in sorted(found["dropped_by_output"].items())
-        ]
-        return lines
+
+
+def _family(name: str, kind: str, meaning: str, samples: Sequence[tuple[Mapping[str, str], Any]]) -> list[str]:
+    """Return one metric in the text format of Prometheus.
+
+    `kind` is "counter" or "gauge". Each of `samples` has the labels of a value, and the value.
+    """
+    lines = [f"# HELP optloc_{name} {meaning}", f"# TYPE optloc_{name} {kind}"]
+    for labels, value in samples:
+        text = ",".join(f'{key}="{_label(word)}"' for key, word in labels.items())
+        lines.append(f"optloc_{name}{{{text}}} {value}" if labels else f"optloc_{name} {value}")
+    return lines
 
 
 def _ms(seconds: float) -> float:

@@ -85,8 +85,8 @@ def run_stream(file: Path, options: ServiceOptions) -> int:
         _signal_handlers(stream) as interrupted,  # before the first line is read
     ):
         stream.watch_output(messages)
-        if settings.track and stream.untracked:
-            raise InvalidProblem(stream.untracked, "--track", "remove this option")
+        if settings.track and stream.track_refusal:
+            raise InvalidProblem(stream.track_refusal, "--track", "remove this option")
         opened = _open(options, stream, adapter)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{opened}")
         _read(options, stream, adapter, recording)

@@ -12,7 +12,7 @@ import numpy as np
 
 from optloc.files import Draft, draft, read_bytes
 from optloc.models import MODELS
-from optloc.service.adapters import Adapter, converted
+from optloc.service.adapters import Adapter, convert
 from optloc.service.queues import QueuedLine
 from optloc.service.stream import Stream
 
@@ -65,7 +65,8 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
         z, count = chunk.table.numbers("z", optional=True), MODELS[chunk.kind].stations
         sigma = chunk.table.numbers("sigma") if chunk.table.has("sigma") else None
         # The reader exchanged the stations of reversed differences. The values of the file need their original order.
-        ends = (chunk.b, chunk.a) if section.positive == "b-farther" and _turned(chunk.kind) else (chunk.a, chunk.b)
+        reversed_rows = section.positive == "b-farther" and _is_reversible(chunk.kind)
+        ends = (chunk.b, chunk.a) if reversed_rows else (chunk.a, chunk.b)
         for i in np.flatnonzero(chunk.weight > 0.0).tolist():
             row: dict[str, object] = {"kind": chunk.kind, "z": float(z[chunk.row[i]])}
             row |= {key: names[int(end[i])] for key, end in zip("ab"[:count], ends, strict=False)}
@@ -77,7 +78,7 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
         yield Recorded(when, json.dumps(line | ({"time": when} if np.isfinite(when) else {})).encode())
 
 
-def _turned(kind: str) -> bool:
+def _is_reversible(kind: str) -> bool:
     """Return whether a row is a difference or ratio of two stations, so that a file may reverse its sign."""
     model = MODELS[kind]
     return model.stations > 1 and not (model.ranges is not None and sum(model.ranges) > 1)
@@ -106,6 +107,6 @@ def replay(
         if stream.inbox.closed:
             return
         when = when if np.isnan(received) else received
-        line, fault = converted(adapter, data)
+        line, fault = convert(adapter, data)
         waiting.append(QueuedLine(line, number, source, stream.clock(), when, fault=fault))
     stream.inbox.put(waiting)

@@ -27,7 +27,7 @@ def serve(
     available, if other machines can reach it without a token, or if a library is missing.
     """
     access = access or AccessRules()
-    if not (is_local(host) or access.tokens or access.open):
+    if not (is_local(host) or access.tokens or access.without_token):
         what = f"other machines reach {host}, and requests need no token"
         raise InvalidProblem(what, "--http", "give --token-file FILE, or --no-token behind a proxy with a password")
     try:

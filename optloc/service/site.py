@@ -180,10 +180,10 @@ class Site:
         Frame of the positions.
     speed : float
         Propagation speed, metres per second.
-    arriving, others : tuple of int
+    arrival_rows, other_rows : tuple of int
         Rows of the template that come from arrivals, which are the rows of the first table of `toa` or `tdoa`; and all
         other rows.
-    hearing : tuple of int
+    arrival_stations : tuple of int
         Stations with arrivals in the template.
     index : dict of (kind, a, b) to int
         Number of each row of the template.
@@ -206,12 +206,19 @@ class Site:
     position: Array
     frame: Frame
     speed: float
-    arriving: tuple[int, ...]
-    others: tuple[int, ...]
-    hearing: tuple[int, ...]
+    arrival_rows: tuple[int, ...]
+    other_rows: tuple[int, ...]
+    arrival_stations: tuple[int, ...]
     index: dict[tuple[str, str, str], int]
     number: dict[str, int]
     options: SiteOptions
+
+    @property
+    def whole(self) -> Ready:
+        """Return the prepared problem of an event with values of all rows."""
+        ready = self.ready((), self.rows)
+        assert ready is not None  # a site has rows
+        return ready
 
     def find(self, kind: str, a: str, b: str) -> int | SiteRow:
         """Return the row of an event by kind and stations.
@@ -269,8 +276,8 @@ class Site:
         if not receivers:
             return ()
         names = [self.stations[i] for i in receivers]
-        kept = [self.rows[i] for i in self.arriving if {self.rows[i].a, self.rows[i].b} - {""} <= set(names)]
-        section, kind = self.rows[self.arriving[0]].section, self.rows[self.arriving[0]].kind
+        kept = [self.rows[i] for i in self.arrival_rows if {self.rows[i].a, self.rows[i].b} - {""} <= set(names)]
+        section, kind = self.rows[self.arrival_rows[0]].section, self.rows[self.arrival_rows[0]].kind
         if kind == "toa":
             listed = {row.a for row in kept}
             return (*kept, *(SiteRow(section, -1, kind, name) for name in names if name not in listed))
@@ -411,15 +418,30 @@ def read_site(path: Path, method: str = "auto", options: SiteOptions | None = No
     problem = draft.loaded.problem
     timed = next((row for row in rows if row.kind in ("toa", "tdoa")), None)
     # Rows of the same section and kind as the first row of `toa` or `tdoa`.
-    arriving = tuple(i for i, row in enumerate(rows) if timed and row[:3:2] == timed[:3:2])
+    arrival_rows = tuple(i for i, row in enumerate(rows) if timed and row[:3:2] == timed[:3:2])
     number = {name: i for i, name in enumerate(problem.stations.names)}
-    hearing = {number[end] for i in arriving for end in (rows[i].a, rows[i].b) if end}
+    arrival_stations = {number[end] for i in arrival_rows for end in (rows[i].a, rows[i].b) if end}
     site = Site(
-        source, draft.loaded.title, method, draft.file, station_table, draft.tables, places, limits, rows,
-        problem.stations.names, problem.stations.position[0], problem.frame, speed_of(file, source), arriving,
-        tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
-        {row[2:5]: i for i, row in enumerate(rows)}, number, options,
-    )  # fmt: skip
+        source=source,
+        title=draft.loaded.title,
+        method=method,
+        file=draft.file,
+        station_table=station_table,
+        tables=draft.tables,
+        places=places,
+        limits=limits,
+        rows=rows,
+        stations=problem.stations.names,
+        position=problem.stations.position[0],
+        frame=problem.frame,
+        speed=speed_of(file, source),
+        arrival_rows=arrival_rows,
+        other_rows=tuple(i for i in range(len(rows)) if i not in arrival_rows),
+        arrival_stations=tuple(sorted(arrival_stations)),
+        index={row[2:5]: i for i, row in enumerate(rows)},
+        number=number,
+        options=options,
+    )
     # report errors of the reader now; an event that cannot be fixed, as with a bias without a prior, gets a status
     # later
     site.ready((), rows)

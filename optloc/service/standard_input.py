@@ -121,7 +121,7 @@ def read_lines(
             if not piece:
                 break
             now = stream.clock()
-            stream.held += _UNCOUNTED * (now - last) if waited else 0.0
+            stream.uncounted += _UNCOUNTED * (now - last) if waited else 0.0
             last = now
             *whole, rest = (rest + piece).split(b"\n")
             if len(rest) > 2 * LINE:

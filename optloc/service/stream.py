@@ -18,14 +18,14 @@ from typing import Any, Self
 from optloc.engine import enabled
 from optloc.files import access
 from optloc.service.account import total
-from optloc.service.adapters import Adapter, converted
+from optloc.service.adapters import Adapter, convert
 from optloc.service.alarms import PATIENCE, Alarm, SourceLost, sentence
 from optloc.service.answers import Record, to_line
 from optloc.service.checkpoint import state_of
 from optloc.service.engine import BATCH, Engine, warm_up
 from optloc.service.events import Event, Events, RefusedRepeat
 from optloc.service.feeds import FORMATS, OF_RECORDS, Latest, to_feed
-from optloc.service.messages import parse, shown_name
+from optloc.service.messages import name_keys, parse
 from optloc.service.metrics import Metrics
 from optloc.service.queues import Inbox, Outbox, QueuedLine, Ticket
 from optloc.service.replies import Replies
@@ -33,7 +33,7 @@ from optloc.service.side_outputs import SideOutput
 from optloc.service.site import Site, UnknownName, read_site
 from optloc.service.stream_files import StreamFiles
 from optloc.service.supervisor import LineSource, RunningSource, Supervisor, Watch
-from optloc.service.tracks import Following, Tracks
+from optloc.service.tracks import Tracks, TrackSettings
 
 LOG = logging.getLogger("optloc.service")
 
@@ -77,7 +77,7 @@ class Settings:
         Seconds between lines of health.
     track : bool
         Whether events are answered by states of tracks instead of fixes.
-    following : Following, optional
+    track_settings : TrackSettings, optional
         Settings of tracks.
     """
 
@@ -93,7 +93,7 @@ class Settings:
     every: float = 5.0
     health: float = 10.0
     track: bool = False
-    following: Following | None = None
+    track_settings: TrackSettings | None = None
 
 
 class Stream:
@@ -143,7 +143,7 @@ class Stream:
         # replaced, never modified, because threads iterate over it
         self.listeners: tuple[Callable[[Record], None], ...] = ()
         # for a source that is a file: seconds that do not count for waiting, and whether it has more to read
-        self.held = 0.0
+        self.uncounted = 0.0
         self.pending: Callable[[], bool] = bool
         self._format = FORMATS[settings.format]
         self._replies = Replies()
@@ -188,7 +188,7 @@ class Stream:
             phases=s.phases,
             deadline=s.deadline,
             shed=s.shed,
-            following=s.following,
+            track_settings=s.track_settings,
         )
 
     # Interface for sources and commands.
@@ -208,7 +208,7 @@ class Stream:
         `track` is as in `QueuedLine`. `adapter` converts the lines; a line on which it fails is refused later.
         """
         now, when = self.clock(), self._time()
-        found = [(i, *converted(adapter, each)) for i, each in enumerate(data, first) if ticket or each.strip()]
+        found = [(i, *convert(adapter, each)) for i, each in enumerate(data, first) if ticket or each.strip()]
         return [QueuedLine(each, i, source, now, when, ticket, track, fault) for i, each, fault in found]
 
     def start(self, source: LineSource) -> RunningSource:
@@ -231,15 +231,15 @@ class Stream:
         return self._engine.tracks
 
     @property
-    def untracked(self) -> str:
+    def track_refusal(self) -> str:
         """Return the reason for which this stream cannot make tracks; empty if it can."""
         if self._settings.part[1] > 1:
             return "this process answers a part of the events, but a track needs all events of its target"
-        return self.tracks.why
+        return self.tracks.refusal
 
     def _time(self) -> float:
         """Return the time of the clock for which events wait, s: the clock without the seconds that do not count."""
-        return self.clock() - self.held
+        return self.clock() - self.uncounted
 
     def close(self) -> None:
         """Read no more lines, answer the waiting lines, and end; `ended` is set after the end of all threads."""
@@ -406,7 +406,7 @@ class Stream:
         self.metrics.counts["malformed"] += 1
         refused: Record = {"error": sentence(error), "line": line.number, "source": line.source}
         if isinstance(error, RefusedRepeat):
-            refused |= {**shown_name(error.name), "code": error.code}
+            refused |= {**name_keys(error.name), "code": error.code}
         if line.ticket is None:
             self._emit(refused)
         return refused
@@ -426,7 +426,7 @@ class Stream:
         with self._settling:
             self._unsettled.update((id(event), event) for event in closed)
         for first in range(0, len(closed), BATCH):
-            self._engine.settle(closed[first : first + BATCH])
+            self._engine.solve(closed[first : first + BATCH])
 
     # Answers, from all threads.
 

@@ -10,7 +10,7 @@ from optloc.files import GrowingFile, write_text
 from optloc.service.answers import Record, to_line
 from optloc.service.checkpoint import restore
 from optloc.service.events import Events
-from optloc.service.messages import stamped
+from optloc.service.messages import with_reading_time
 from optloc.service.side_outputs import SideOutput
 from optloc.service.state_lock import StateLock
 
@@ -79,7 +79,7 @@ class StreamFiles:
     def record(self, data: bytes, stamp: float) -> None:
         """Record a line with its time of reading, `stamp`, s, as the first key of its JSON object."""
         if self._record is not None:
-            self._lines += stamped(data, stamp) + b"\n"
+            self._lines += with_reading_time(data, stamp) + b"\n"
             self._count += 1
             if len(self._lines) > _BUFFER:
                 self.write_record()

@@ -1,7 +1,7 @@
 """Strict JSON: one object from bytes of a stranger, or one sentence that refuses them.
 
-RFC 8259 leaves repeated keys, lone surrogates, depth and sizes to each program. Programs that differ in them can be
-played off against each other, so a stream refuses all of them.
+RFC 8259 leaves repeated keys, lone surrogates, depth and sizes to each program. Two programs may then read one line
+differently, so a stream refuses such lines.
 """
 
 from __future__ import annotations

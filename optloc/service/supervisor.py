@@ -102,7 +102,7 @@ class Supervisor:
         Receives one record for each failure and each recovery.
     clock : callable
         Monotonic clock, s.
-    watched : callable
+    on_start : callable
         Receives the state of each new source, for health and metrics.
     """
 
@@ -111,15 +111,15 @@ class Supervisor:
         close: Callable[[], None],
         report: Callable[[dict[str, Any]], None],
         clock: Callable[[], float],
-        watched: Callable[[Watch], None] = lambda watch: None,
+        on_start: Callable[[Watch], None] = lambda watch: None,
     ) -> None:
-        self._close, self._report, self._clock, self._watched = close, report, clock, watched
+        self._close, self._report, self._clock, self._on_start = close, report, clock, on_start
         self._lock, self._running, self._ends = Lock(), list[RunningSource](), False
 
     def start(self, source: LineSource) -> RunningSource:
         """Run a source in a separate thread until it ends, is given up or is stopped; after `stop`, it does not run."""
         watch = Watch(source.name, self._clock, self._report)
-        self._watched(watch)
+        self._on_start(watch)
         thread = Thread(target=self._run, args=(source, watch), name=f"optloc {source.name}", daemon=True)
         running = RunningSource(source, watch, thread)
         with self._lock:

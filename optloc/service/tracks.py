@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.problem import Array, InvalidProblem, Problem
-from optloc.service.answers import UNNAMED, Record, track_record, unsolved
+from optloc.service.answers import UNNAMED, Record, track_record, unsolved_record
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics
 from optloc.tracking import Dynamics, Entry, Follower, Rules, Update, alone, polynomial
@@ -25,7 +25,7 @@ _WAITING = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Following:
+class TrackSettings:
     """Settings of the tracks of a stream, and their largest number.
 
     Parameters
@@ -49,6 +49,10 @@ class Following:
     most: int = 1024
     age: float = 300.0
 
+    def follower(self) -> Follower:
+        """Return the tracker of a new target."""
+        return Follower(self.dynamics, self.update, self.rules)
+
 
 class Scan(NamedTuple):
     """An event in the form for a tracker: its problem, and its measurements (m,)."""
@@ -62,13 +66,13 @@ class Scan(NamedTuple):
 class _StoredTrack:
     """A stored track.
 
-    follower: tracker of the target. origin: time of its first event, picoseconds. heard: time of its last event by the
-    clock of the stream, s. last: last answer.
+    follower: tracker of the target. origin: time of its first event, picoseconds. updated: time of its last event by
+    the clock of the stream, s. last: last answer.
     """
 
     follower: Follower
     origin: int
-    heard: float = 0.0
+    updated: float = 0.0
     last: Record | None = None
 
 
@@ -79,7 +83,7 @@ class Tracks:
     ----------
     problem : Problem
         Problem of a whole event of the site.
-    how : Following
+    settings : TrackSettings
         Settings.
     metrics : Metrics
         Counters.
@@ -92,12 +96,12 @@ class Tracks:
     def __init__(
         self,
         problem: Problem,
-        how: Following,
+        settings: TrackSettings,
         metrics: Metrics,
         emit: Callable[[Event, Record], None],
         clock: Callable[[], float],
     ) -> None:
-        self._how, self._metrics, self._emit, self._clock = how, metrics, emit, clock
+        self._settings, self._metrics, self._emit, self._clock = settings, metrics, emit, clock
         # tracks by target, in the order of their last events, the oldest first
         self._kept: dict[str, _StoredTrack] = {}
         self._waiting, self._ends = deque[Scan](), False
@@ -107,9 +111,9 @@ class Tracks:
         metrics.gauges |= {"scans": lambda: len(self._waiting), "tracks": lambda: len(self._kept)}
 
     @cached_property
-    def why(self) -> str:
+    def refusal(self) -> str:
         """Return the reason for which events of the site make no tracks; empty if they do."""
-        return _reason_without_tracks(self._problem, self._how)
+        return _reason_without_tracks(self._problem, self._settings)
 
     def take(self, scans: Sequence[Scan]) -> None:
         """Queue events in the order in which they closed; the caller waits while the queue is full."""
@@ -141,7 +145,7 @@ class Tracks:
         with self._changed:
             now = self._clock()
             self._forget(now)
-            kept = [(each.last, now - each.heard) for each in self._kept.values() if each.last is not None]
+            kept = [(each.last, now - each.updated) for each in self._kept.values() if each.last is not None]
         return [record | {"age": round(age, 3)} for record, age in reversed(kept)]
 
     def _run(self) -> None:
@@ -156,25 +160,25 @@ class Tracks:
             try:
                 record = self._track_event(*scan)
             except Exception as error:  # noqa: BLE001  # an error of one event must not end the stream
-                record = self._failed(scan.event, error)
-            self._metrics.took("track", [self._clock() - scan.event.stamp])
+                record = self._error_record(scan.event, error)
+            self._metrics.note_latency("track", [self._clock() - scan.event.stamp])
             self._emit(scan.event, record)
 
-    def _failed(self, event: Event, error: Exception) -> Record:
+    def _error_record(self, event: Event, error: Exception) -> Record:
         """Return the answer to an event whose track failed.
 
         An unexpected error also removes the track.
         """
         if isinstance(error, InvalidProblem):
             self._metrics.add("unsolvable")
-            return unsolved(event, phase="track", error=str(error))
+            return unsolved_record(event, phase="track", error=str(error))
         LOG.error("event %s failed in its track", event.name, exc_info=error)
         # remove the track, since its state may be half updated
         with self._changed:
             self._kept.pop(event.target or UNNAMED, None)
         self._metrics.add("unsolvable")
         self._metrics.add("forgotten")
-        return unsolved(event, phase="track", error=f"{type(error).__name__}: {error}; a new track starts")
+        return unsolved_record(event, phase="track", error=f"{type(error).__name__}: {error}; a new track starts")
 
     def _track_event(self, event: Event, problem: Problem, z: Array) -> Record:
         """Return the answer to an event from the track of its target.
@@ -182,14 +186,14 @@ class Tracks:
         `z` (m,) are the measurements of `problem`, SI. An event that is not later than the last event of its track is
         refused. Raise InvalidProblem for an event without a time, or a site without tracks.
         """
-        if self.why:
-            raise InvalidProblem(self.why, None, "request fixes instead of tracks")
+        if self.refusal:
+            raise InvalidProblem(self.refusal, None, "request fixes instead of tracks")
         when = event.when if event.when is not None else min(event.times.values(), default=None)
         if when is None:
             raise InvalidProblem("a track needs the time of the event", "time", "add time, time_ns or time_ps")
         name = event.target or UNNAMED
         kept = self._kept.get(name)
-        track = kept or _StoredTrack(Follower(self._how.dynamics, self._how.update, self._how.rules), when)
+        track = kept or _StoredTrack(self._settings.follower(), when)
         # subtract integers of picoseconds first, since a float would lose digits
         time = (when - track.origin) * 1e-12
         if track.follower.last >= time:
@@ -198,17 +202,17 @@ class Tracks:
                 f"the event is {track.follower.last - time:.6g} s before the last event of {name}, or at the same time"
             )
             error = InvalidProblem(what, "time", "send the events of a target in the order of their times")
-            return unsolved(event, phase="track", error=str(error))
+            return unsolved_record(event, phase="track", error=str(error))
         entries = track.follower.take(scan_of(problem, z, time))
         entry = entries[-1] if entries and entries[-1].time == time else None
         record = _answer_of(event, when, entry, track.follower, problem)
         with self._changed:
             now = self._clock()
             self._kept.pop(name, None)
-            track.heard, track.last = now, record
+            track.updated, track.last = now, record
             self._kept[name] = track
             self._metrics.add("tracked")
-            self._metrics.followed(record["status"])
+            self._metrics.count_scan(record["status"])
             self._forget(now)
         return record
 
@@ -216,7 +220,7 @@ class Tracks:
         """Remove tracks without recent events, and tracks beyond the largest number."""
         while self._kept:
             name = next(iter(self._kept))
-            if len(self._kept) <= self._how.most and now - self._kept[name].heard <= self._how.age:
+            if len(self._kept) <= self._settings.most and now - self._kept[name].updated <= self._settings.age:
                 return
             del self._kept[name]
             self._metrics.add("forgotten")
@@ -236,13 +240,13 @@ def _answer_of(event: Event, when: int, entry: Entry | None, follower: Follower,
     if entry is not None:
         return track_record(event, when * 1e-12, entry, problem)
     outcome = {"status": "lost", "reason": follower.lost} if follower.lost else {"status": "starting"}
-    return unsolved(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **outcome)
+    return unsolved_record(event, phase="track", target=event.target or UNNAMED, time=when * 1e-12, **outcome)
 
 
-def _reason_without_tracks(problem: Problem, how: Following) -> str:
+def _reason_without_tracks(problem: Problem, settings: TrackSettings) -> str:
     """Return the reason for which events of a site make no tracks; empty if they do.
 
-    `how` has the settings of the tracks. A track is started with measurements that are zero, to find errors of the
+    A track is started with measurements that are zero, to find errors of the
     settings.
     """
     if problem.priors:
@@ -251,7 +255,7 @@ def _reason_without_tracks(problem: Problem, how: Following) -> str:
         return "the file has several targets, or a known target"
     try:
         with np.errstate(all="ignore"):
-            Follower(how.dynamics, how.update, how.rules).take(scan_of(problem, np.zeros(problem.count), 0.0))
+            settings.follower().take(scan_of(problem, np.zeros(problem.count), 0.0))
     except InvalidProblem as error:
         return str(error)
     return ""

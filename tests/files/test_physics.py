@@ -107,7 +107,7 @@ def test_a_live_site_refuses_a_negative_range_and_warns_once(folder, caplog):
     sent = [{i: 100.0 * z for i, z in good.items()}] * 2 + [good | {2: -3.0}]
     with caplog.at_level(logging.WARNING):
         for number, rows in enumerate(sent):
-            engine.settle([Event(str(number), rows, {}, 0.0, 0.0, closed="whole")])
+            engine.solve([Event(str(number), rows, {}, 0.0, 0.0, closed="whole")])
     assert "the range at C is -3 m, and no distance is negative" in answers[-1]["error"]
     assert sum("100 times too large" in one.message for one in caplog.records) == 1
 

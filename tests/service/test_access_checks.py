@@ -6,7 +6,7 @@ from base64 import b64encode
 
 import pytest
 
-from optloc.service.access_checks import SAFE, AccessChecks
+from optloc.service.access_checks import SAFE_HEADERS, AccessChecks
 from optloc.service.http_options import AccessRules, digest_of
 
 TOKEN = "0123456789abcdef"
@@ -54,7 +54,7 @@ def test_other_names_are_refused(host):
 
 
 def test_an_open_server_has_addresses_and_stated_names_only():
-    access = AccessRules(hosts=("fixes.org",), open=True)
+    access = AccessRules(hosts=("fixes.org",), without_token=True)
     for host, expected in (
         ("192.168.1.5:8200", 200),
         ("[2001:db8::1]", 200),
@@ -134,6 +134,6 @@ def test_all_answers_have_the_headers_and_keep_their_own():
     (refused, _), _ = asked(host="evil.example")
     for message, others in ((start, {"X-Frame-Options"}), (refused, set())):
         found = dict(message["headers"])
-        assert {name: found[name.lower().encode()].decode() for name in SAFE.keys() - others} == {
-            name: SAFE[name] for name in SAFE.keys() - others
+        assert {name: found[name.lower().encode()].decode() for name in SAFE_HEADERS.keys() - others} == {
+            name: SAFE_HEADERS[name] for name in SAFE_HEADERS.keys() - others
         }

@@ -33,9 +33,9 @@ def test_lines_move_from_open_to_one_state():
     assert account.difference({"pipe": 1}) == {}
     assert account.difference({}) == {"pipe": 1}
     # a checkpoint with no open event: the line in the queue is not received yet
-    assert account.stored({})["pipe"] == counts(received=3, answered=2, dropped=1)
+    assert account.for_checkpoint({})["pipe"] == counts(received=3, answered=2, dropped=1)
     other = Account()
-    other.restore(account.stored({"pipe": 1}))
+    other.restore(account.for_checkpoint({"pipe": 1}))
     assert other.records() == account.records()
     assert total([{"a": 1}, {"a": 2, "b": 1}]) == Counter(a=3, b=1)
 

@@ -6,7 +6,7 @@ import pytest
 from service.lines import EPOCH, Answers, answers, arrivals, line, site_in
 
 from optloc.problem import InvalidProblem
-from optloc.service.adapters import ChirpStack, ModeS, adapter_of, converted
+from optloc.service.adapters import ChirpStack, ModeS, adapter_of, convert
 from optloc.service.site import FAST
 from optloc.service.standard_input import read_lines
 from optloc.service.stream import Settings, Stream
@@ -64,9 +64,9 @@ def fails_for_letters(data):
 
 
 def test_an_adapter_that_fails_refuses_one_line():
-    assert converted(None, b"x") == (b"x", "")
-    assert converted(fails_for_letters, b"1")[1] == ""
-    data, fault = converted(fails_for_letters, b"x")
+    assert convert(None, b"x") == (b"x", "")
+    assert convert(fails_for_letters, b"1")[1] == ""
+    data, fault = convert(fails_for_letters, b"x")
     assert data == b"x"
     assert fault.startswith("the adapter cannot convert this line (ValueError: ")
     with pytest.raises(InvalidProblem, match="there is no format 'none'"):

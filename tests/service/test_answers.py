@@ -5,7 +5,7 @@ import json
 from show.ranging import ranged
 
 from optloc.base.types import Status
-from optloc.service.answers import fix_records, join, proof_records, to_line, unproven, unsolved
+from optloc.service.answers import fix_records, join, proof_records, to_line, unproven_record, unsolved_record
 from optloc.service.events import Event
 from optloc.solvers import solve
 from optloc.tracking.entry import scan_sentence
@@ -32,27 +32,27 @@ def test_both_phases_are_one_record():
 
 
 def test_an_event_says_what_is_not_as_usual_about_it():
-    found = unsolved(event(closed="wait", revision=2, conflict=True, target="t"), error="why")
+    found = unsolved_record(event(closed="wait", revision=2, conflict=True, target="t"), error="why")
     assert found == {
         "event": "7", "phase": "fix", "error": "why", "position": None,
         "closed": "wait", "revision": 2, "conflict": True, "target": "t",
     }  # fmt: skip
-    assert unsolved(event(), status="too few rows") == {
+    assert unsolved_record(event(), status="too few rows") == {
         "event": "7",
         "phase": "fix",
         "status": "too few rows",
         "sentence": Status.TOO_FEW_ROWS.sentence,
         "position": None,
     }
-    assert unsolved(event(), phase="track", status="lost")["sentence"] == scan_sentence("lost")
+    assert unsolved_record(event(), phase="track", status="lost")["sentence"] == scan_sentence("lost")
 
 
 def test_a_proof_that_was_not_finished_keeps_the_status():
-    found = unproven(event(), "deadline", FIX, answered=True)
+    found = unproven_record(event(), "deadline", FIX, answered=True)
     assert (found["phase"], found["status"], found["proof"], found["why"]) == ("proof", "ok", "unknown", "deadline")
     assert (found["sentence"], "revision" in found) == (Status.OK.sentence, False)
-    assert unproven(event(revision=2), "deadline", FIX, answered=True)["revision"] == 2
-    whole = unproven(event(), "skipped: load", FIX | {"status": "unproven"}, answered=False)
+    assert unproven_record(event(revision=2), "deadline", FIX, answered=True)["revision"] == 2
+    whole = unproven_record(event(), "skipped: load", FIX | {"status": "unproven"}, answered=False)
     assert (whole["position"], whole["why"]) == ([1.0, 2.0], "skipped: load")
     assert "its proof was given up" in whole["sentence"]
 

@@ -40,8 +40,8 @@ def test_options_become_the_settings_of_a_stream():
         "wait": 0.05, "revise": True, "phases": "one", "deadline": None, "part": (1, 3), "format": "geojson"
     }  # fmt: skip
     assert _tracking("cv", "iekf", None, None, track=True) == {"track": True}
-    following = _tracking("ca", "iekf", None, 7.0, track=True)["following"]
-    assert (following.rules.gap, following.dynamics.order) == (7.0, 2)
+    track_settings = _tracking("ca", "iekf", None, 7.0, track=True)["track_settings"]
+    assert (track_settings.rules.gap, track_settings.dynamics.order) == (7.0, 2)
 
 
 def test_each_line_that_check_shows_is_one_that_the_site_takes(tmp_path, capsys):

@@ -10,7 +10,7 @@ from service.lines import Answers, arrivals, ask, differences, line
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
-from optloc.service.access_checks import SAFE
+from optloc.service.access_checks import SAFE_HEADERS
 from optloc.service.serve import serve
 from optloc.service.stream import Settings, Stream
 
@@ -127,7 +127,7 @@ def test_all_answers_have_safe_headers_and_refusals_are_json(server, method, pat
     code, found, said = ask(server[1], method, path, **headers)
     assert code == expected
     found = {name.lower(): value for name, value in found.items()}
-    for name, value in SAFE.items():
+    for name, value in SAFE_HEADERS.items():
         assert found[name.lower()] == (value if path != "/" or "Policy" not in name[:24] else found[name.lower()])
     assert "frame-ancestors 'none'" in found["content-security-policy"]
     assert "server" not in found

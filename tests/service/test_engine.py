@@ -35,7 +35,7 @@ def events(z):
 
 def test_events_by_rows_have_the_fixes_of_solve(site):
     z, out, metrics = differences(site, arrivals(site, 3)), Answers(), Metrics()
-    Engine(site, metrics, out, lambda: 1.0, phases="fix").settle(events(z))
+    Engine(site, metrics, out, lambda: 1.0, phases="fix").solve(events(z))
     wanted = solved(site, z, FAST)[1].position
     assert [(name, last) for name, _, last in out.all] == [("0", True), ("1", True), ("2", True)]
     np.testing.assert_allclose([record["position"] for _, record, _ in out.all], wanted, atol=1e-6)
@@ -45,7 +45,7 @@ def test_events_by_rows_have_the_fixes_of_solve(site):
 def test_events_with_too_few_rows_and_refused_ones_are_answered_at_once(site):
     out = Answers()
     refused = Event("bad", {}, {}, 0.0, 0.0, refused="there is no station 'G'")
-    Engine(site, Metrics(), out, lambda: 0.0, phases="fix").settle([refused, Event("none", {}, {}, 0.0, 0.0)])
+    Engine(site, Metrics(), out, lambda: 0.0, phases="fix").solve([refused, Event("none", {}, {}, 0.0, 0.0)])
     (first, error, last), (second, few, _) = out.all
     assert (first, error["error"], last) == ("bad", "there is no station 'G'", True)
     assert (second, few["status"]) == ("none", "too few rows")
@@ -55,7 +55,7 @@ def test_a_proof_that_is_not_there_in_time_is_given_up(site, monkeypatch):
     out, now, gate = Answers(), [0.0], Flag()
     monkeypatch.setattr(lines, "Slow", lambda prepared, busy: lambda z: gate.wait(30.0) and prepared(z))
     engine = Engine(slowed(site), Metrics(), out, lambda: now[0], deadline=0.5)
-    engine.settle(events(differences(site, arrivals(site, 1))))
+    engine.solve(events(differences(site, arrivals(site, 1))))
     assert engine.next_due == 0.5
     now[0] = 0.6
     engine.expire()

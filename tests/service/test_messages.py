@@ -7,7 +7,7 @@ import pytest
 from service.lines import line, site_in
 
 from optloc.base.errors import InvalidProblem
-from optloc.service.messages import LINE, parse, picoseconds, scoped, scoped_under, shown_name, stamped
+from optloc.service.messages import LINE, full_name, full_name_under, name_keys, parse, picoseconds, with_reading_time
 
 
 @pytest.fixture(scope="module")
@@ -83,17 +83,17 @@ def test_pairs_of_surrogates_are_characters(site):
 
 def test_ids_belong_to_their_client(site):
     own = parse(line(event="1", client="roof", z=[0.0] * 5), site).event
-    assert own == scoped("roof", "1") != parse(line(event="1", z=[0.0] * 5), site).event
-    assert shown_name(own) == {"event": "1", "client": "roof"}
-    assert scoped_under("event", own) == own
+    assert own == full_name("roof", "1") != parse(line(event="1", z=[0.0] * 5), site).event
+    assert name_keys(own) == {"event": "1", "client": "roof"}
+    assert full_name_under("event", own) == own
     for name in ("a\nb\nc", "\nb", "a\n"):
         with pytest.raises(InvalidProblem, match="is not a name"):
-            scoped_under("event", name)
+            full_name_under("event", name)
 
 
 def test_a_line_is_recorded_with_one_time_of_reading():
-    assert stamped(b'{"event":"1"}', 2.0) == b'{"received":2.000000,"event":"1"}'
-    assert json.loads(stamped(b'{"event":"1","received":1}', 2.0)) == {"received": 2.0, "event": "1"}
+    assert with_reading_time(b'{"event":"1"}', 2.0) == b'{"received":2.000000,"event":"1"}'
+    assert json.loads(with_reading_time(b'{"event":"1","received":1}', 2.0)) == {"received": 2.0, "event": "1"}
 
 
 def test_an_id_may_be_a_number_and_is_told_as_text(site):

@@ -9,19 +9,19 @@ from optloc.service.metrics import COUNTS, PHASES, Metrics
 def test_percentiles_are_those_of_the_latest_latencies():
     metrics = Metrics()
     assert np.isnan(metrics.percentiles("fix")).all()
-    metrics.took("fix", [1.0] * 4096)
-    metrics.took("fix", list(np.linspace(2.0, 3.0, 4096)))  # all others have left
+    metrics.note_latency("fix", [1.0] * 4096)
+    metrics.note_latency("fix", list(np.linspace(2.0, 3.0, 4096)))  # all others have left
     assert metrics.percentiles("fix") == pytest.approx([2.5, 2.99])
 
 
 def test_health_tells_counts_statuses_and_silence():
     metrics = Metrics()
     metrics.add("lines", 3)
-    metrics.concluded("ok", "global")
-    metrics.concluded("misfit", None)
-    metrics.hear(["B", "A"], 10.0)
+    metrics.count_event("ok", "global")
+    metrics.count_event("misfit", None)
+    metrics.note_rows(["B", "A"], 10.0)
     metrics.gauges["proofs"] = lambda: 7
-    metrics.took("fix", [0.002])
+    metrics.note_latency("fix", [0.002])
     found = metrics.health(12.5, {"version": "x"})
     assert next(iter(found)) == "version"
     assert (found["lines"], found["rows"]) == (3, 0)
@@ -32,8 +32,8 @@ def test_health_tells_counts_statuses_and_silence():
 
 def test_the_text_for_prometheus_has_every_count_and_escapes_names():
     metrics = Metrics()
-    metrics.hear(['a"b\\c'], 1.0)
-    metrics.took("track", [0.5])
+    metrics.note_rows(['a"b\\c'], 1.0)
+    metrics.note_latency("track", [0.5])
     lines = metrics.text(3.0).splitlines()
     assert [name for name in COUNTS if f"optloc_{name}_total 0" not in lines] == []
     assert 'optloc_silence_seconds{station="a\\"b\\\\c"} 2.0' in lines

@@ -24,7 +24,7 @@ from optloc.files import read  # noqa: E402
 from optloc.service.http_options import AccessRules, digest_of  # noqa: E402
 from optloc.service.serve import serve  # noqa: E402
 from optloc.service.stream import Settings, Stream  # noqa: E402
-from optloc.service.tracks import Following  # noqa: E402
+from optloc.service.tracks import TrackSettings  # noqa: E402
 from optloc.tracking import polynomial, tracked  # noqa: E402
 
 
@@ -170,7 +170,7 @@ def test_what_no_track_can_take_is_refused_and_counted(site, served):
 
 def test_tracks_are_bounded_in_number_and_age(site):
     z, now, out = flight(site, 1)[1].tolist(), [0.0], Answers()
-    settings = Settings(track=True, following=Following(most=3, age=10.0))
+    settings = Settings(track=True, track_settings=TrackSettings(most=3, age=10.0))
     stream = Stream(site, settings, out, clock=lambda: now[0])
     for i in range(5):
         stream.inbox.put(stream.lines([line(event=str(i), z=z[0], time=i, target=str(i))], "test"))
@@ -253,7 +253,7 @@ def test_other_machines_need_a_token(served, host):
     assert "--token-file FILE, or --no-token" in str(caught.value)
 
 
-@pytest.mark.parametrize("access", [AccessRules(tokens=(digest_of("x" * 16),)), AccessRules(open=True)])
+@pytest.mark.parametrize("access", [AccessRules(tokens=(digest_of("x" * 16),)), AccessRules(without_token=True)])
 def test_a_server_for_others_answers_under_its_address(site, access):
     stream = Stream(site, Settings(), Answers())
     port, stop = serve(stream, "0.0.0.0", 0, access)

@@ -110,9 +110,9 @@ def run_drawn(site, events):
             metrics.counts["malformed"] += 1
         taken.due(stamp, stamp)
         if len(taken.ready) >= 64:
-            engine.settle(taken.closing())
+            engine.solve(taken.closing())
     taken.flush(now[0])
-    engine.settle(taken.closing())
+    engine.solve(taken.closing())
     engine.stop()
     assert {name: len(each) for name, each in found.items()} == dict.fromkeys(held, 1)
     # an event whose late rows came before its time was over would be whole: none is

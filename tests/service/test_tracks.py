@@ -8,7 +8,7 @@ from optloc import solve
 from optloc.service.events import Event
 from optloc.service.metrics import Metrics
 from optloc.service.site import FAST
-from optloc.service.tracks import Following, Scan, Tracks, scan_of
+from optloc.service.tracks import Scan, Tracks, TrackSettings, scan_of
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def problem(site):
 
 
 def tracks(problem, out, now, **more):
-    return Tracks(problem, Following(**more), Metrics(), lambda event, record: out.append(record), lambda: now[0])
+    return Tracks(problem, TrackSettings(**more), Metrics(), lambda event, record: out.append(record), lambda: now[0])
 
 
 def scan(problem, z, seconds, target="t"):
@@ -60,4 +60,4 @@ def test_a_scan_is_one_epoch_with_the_measurements_of_the_event(problem):
     found = scan_of(problem, z, 7.0)
     assert (found.epochs, found.times.tolist()) == (1, [7.0])
     np.testing.assert_array_equal(found.z, z)
-    assert tracks(problem, [], [0.0]).why == ""
+    assert tracks(problem, [], [0.0]).refusal == ""
