@@ -18,8 +18,10 @@ from optloc.service.supervisor import LineSource, Watch
 _LOOK = 0.2
 # Seconds after which MQTT tests the connection to a silent broker.
 _KEEPALIVE = 30
-# Seconds to connect to a broker: less than the seconds for which the end of the stream waits for the source.
+# Seconds to connect to a broker, and then for the TLS handshake, which cannot be interrupted: four round trips over a
+# satellite. The end of the stream waits for both, and for a look.
 _CONNECT = 4.0
+_PATIENCE = 2.0 * _CONNECT + 1.0
 
 
 def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSource:
@@ -69,7 +71,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSo
                 raise SourceLost(refusal[0] if refusal else f"the broker is lost ({paho.error_string(code)})")
         client.disconnect()
 
-    return LineSource("mqtt", run)
+    return LineSource("mqtt", run, patience=_PATIENCE)
 
 
 def _mqtt_client(parts: Any) -> Any:

@@ -131,6 +131,19 @@ def test_a_source_that_waits_for_its_broker_ends_with_its_stream(stream, broker)
     assert not made.thread.is_alive()
 
 
+def test_a_server_that_does_not_answer_holds_no_source(stream, monkeypatch):
+    pytest.importorskip("paho.mqtt.client")
+    monkeypatch.setattr("optloc.service.brokers._CONNECT", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        place = f"127.0.0.1:{silent.getsockname()[1]}/t"
+        with pytest.raises(InvalidProblem, match="the broker cannot be reached"):
+            mqtt(stream, f"mqtts://{place}")
+        made = stream.start(mqtt(stream, f"mqtt://{place}"))
+        stream.close()
+        assert stream.ended.wait(10.0)
+    assert not made.thread.is_alive()
+
+
 @pytest.mark.slow
 def test_a_command_that_ends_without_its_broker_has_an_exit_code(tmp_path, broker):
     site_in(tmp_path)
