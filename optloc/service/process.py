@@ -42,12 +42,30 @@ _ENVIRONMENT = {"OPTLOC_THREADS": "1", "OPTLOC_COMPILE": "child"}
 class ServiceOptions:
     """Options of the commands `live` and `serve`.
 
-    settings: arguments of the stream settings except `shed`, which depends on the source. method: method of the fixes.
-    recording: file to read instead of standard input. speed: replay speed relative to the recording. shed: whether
-    proofs are skipped under load; None means yes, unless the source can wait. quiet: whether messages and health are
-    not printed. http, mqtt, zmq, adapter: as the options. stdin: whether lines come from standard input if there is no
-    recording. stdout: whether answers go to standard output. stated: options on the wave and the height, or None.
-    access: rules of access to HTTP, or None.
+    Parameters
+    ----------
+    settings : dict
+        Arguments of `optloc.service.stream.Settings` except `shed`, which depends on the source.
+    method : str
+        Method of the fixes.
+    recording : Path, optional
+        File to read instead of standard input.
+    speed : float
+        Replay speed relative to the recording.
+    shed : bool, optional
+        Whether proofs are skipped under load; None means yes, unless the source can wait.
+    quiet : bool
+        Whether messages and health are not printed.
+    http, mqtt, zmq, adapter : str, optional
+        Values of the options of these names.
+    stdin : bool
+        Whether lines come from standard input if there is no recording.
+    stdout : bool
+        Whether answers go to standard output.
+    stated : SiteOptions, optional
+        Options on the wave and the height.
+    access : AccessRules, optional
+        Rules of access to HTTP.
     """
 
     settings: dict[str, Any]
@@ -79,17 +97,17 @@ def run_stream(file: Path, options: ServiceOptions) -> int:
     settings = _settings_of(options)
     claim(settings.record, inputs=[file])
     with (
-        _threads(),
+        _stream_environment(),
         standard_error(quiet=options.quiet) as (say, messages),
-        Stream(site, settings, _writer(options), say, again=file, replayed=recording is not None) as stream,
+        Stream(site, settings, _writer(options), say, site_file=file, replayed=recording is not None) as stream,
         _signal_handlers(stream) as interrupted,  # before the first line is read
     ):
         stream.watch_output(messages)
         if settings.track and stream.track_refusal:
             raise InvalidProblem(stream.track_refusal, "--track", "remove this option")
-        opened = _open(options, stream, adapter)
+        opened = _start_servers(options, stream, adapter)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{opened}")
-        _read(options, stream, adapter, recording)
+        _start_reading(options, stream, adapter, recording)
         code = wait(stream, interrupted)
         failed = stream.sources.failed
         if failed:
@@ -107,8 +125,8 @@ def _settings_of(options: ServiceOptions) -> Settings:
     return Settings(shed=shed, **({} if shed else {"deadline": inf}) | given)
 
 
-def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None) -> str:
-    """Start the HTTP, MQTT and ZeroMQ sources, and return a text on them for the ready message."""
+def _start_servers(options: ServiceOptions, stream: Stream, adapter: Adapter | None) -> str:
+    """Start the HTTP, MQTT and ZeroMQ sources, and return the address of HTTP for the ready message; "" without one."""
     opened = ""
     if options.http is not None:
         host, port = address_of(options.http)
@@ -120,7 +138,9 @@ def _open(options: ServiceOptions, stream: Stream, adapter: Adapter | None) -> s
     return opened
 
 
-def _read(options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None) -> None:
+def _start_reading(
+    options: ServiceOptions, stream: Stream, adapter: Adapter | None, recording: list[Recorded] | None
+) -> None:
     """Read a recording or standard input in a separate thread, if requested."""
     if recording is not None:
         name = str(options.recording)
@@ -188,7 +208,7 @@ def _signals(handlers: dict[str, Callable[[int, Any], None]]) -> Iterator[None]:
 
 
 @contextmanager
-def _threads() -> Iterator[None]:
+def _stream_environment() -> Iterator[None]:
     """Set a short thread switch interval, and the environment of a stream unless variables are already set."""
     old, added = sys.getswitchinterval(), {name: _ENVIRONMENT[name] for name in _ENVIRONMENT.keys() - os.environ.keys()}
     sys.setswitchinterval(_SWITCH)

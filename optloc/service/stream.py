@@ -113,7 +113,7 @@ class Stream:
         Prints a line for people, such as health.
     clock : callable
         Monotonic clock, s.
-    again : Path, optional
+    site_file : Path, optional
         File of the site, for reloading.
     replayed : bool
         Whether lines have recorded times of reading: events then close by these times, at any replay speed.
@@ -131,11 +131,11 @@ class Stream:
         write: Callable[[bytes], None],
         say: Callable[[str], None] = lambda line: None,
         clock: Callable[[], float] = monotonic,
-        again: Path | None = None,
+        site_file: Path | None = None,
         *,
         replayed: bool = False,
     ) -> None:
-        self.site, self._settings, self._say, self.clock, self._again = site, settings, say, clock, again
+        self.site, self._settings, self._say, self.clock, self._site_file = site, settings, say, clock, site_file
         self._replayed = replayed
         self.metrics, self.latest = Metrics(), Latest()
         self.inbox = Inbox(account=self.metrics.account)
@@ -485,11 +485,11 @@ class Stream:
 
     def _reload_site(self) -> None:
         """Reload the file of the site after the events of the old site are answered."""
-        if self._again is None:
+        if self._site_file is None:
             return
         try:
             with access(anew=True):
-                site = read_site(self._again, self.site.method, self.site.options)
+                site = read_site(self._site_file, self.site.method, self.site.options)
             warm_up(site, self._settings.phases)
         except Exception as error:  # noqa: BLE001  # an error of the new file must not end the stream
             self._say(f"The site is not changed: {sentence(error)}")

@@ -15,7 +15,7 @@ from benchmarks.test_latency import general
 from data.windows import report
 from service.lines import Answers, arrivals, balanced, differences, line, site_in, slowed
 
-from optloc.service.process import _threads
+from optloc.service.process import _stream_environment
 from optloc.service.stream import Settings, Stream
 
 EVENTS = 20_000
@@ -136,7 +136,7 @@ def test_at_three_thousand_events_a_second_nothing_is_lost(feed):
 def test_latency_beside_proofs_of_40_milliseconds(tmp_path, busy):
     site = site_in(tmp_path)
     rows = differences(site, arrivals(site, 2000))
-    with _threads():  # as the command has them
+    with _stream_environment():  # as the command has them
         stream = Stream(slowed(site, busy), Settings(), Answers())
         began = time.perf_counter()
         for i, z in enumerate(rows.tolist()):

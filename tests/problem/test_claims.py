@@ -84,3 +84,11 @@ def test_the_advice_for_an_unproven_fix_is_a_step_that_was_not_taken(certificate
     assert advice in sentence
     assert absent not in sentence
     assert sentences_of(np.asarray(Status.CURVED), claim(certificate))[()] == Status.CURVED.sentence
+
+
+def test_a_batch_has_the_sentences_of_its_fixes():
+    problem = simulate(CASES["tdoa-3d"].problem, CASES["tdoa-3d"].truth, 1, trials=4)
+    for method in ("gtrs+lsr", "auto"):
+        fix = solve(problem, method)
+        assert fix.sentence.tolist() == [fix[i].sentence for i in range(4)]
+        assert isinstance(fix[0].sentence, str)

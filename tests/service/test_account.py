@@ -141,7 +141,7 @@ def test_lines_of_other_processes_are_dropped(site, z):
 def test_a_reload_answers_the_open_lines(tmp_path, z):
     site = site_in(tmp_path, method=FAST)
     said, out = [], Answers()
-    stream = Stream(site, Settings(phases="fix", wait=60.0), out, said.append, again=tmp_path / "site.toml")
+    stream = Stream(site, Settings(phases="fix", wait=60.0), out, said.append, site_file=tmp_path / "site.toml")
     assert sent(stream, part("1", "A")) == counts(received=1, open=1)
     (tmp_path / "site.toml").write_text(SITE.replace("Six receivers", "Others"))
     stream.reload()

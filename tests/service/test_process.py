@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from optloc import InvalidProblem
 from optloc.cli import app
 from optloc.service.adapters import adapter_of
-from optloc.service.process import _threads, wait
+from optloc.service.process import _stream_environment, wait
 
 
 def test_a_stream_ends_with_the_code_of_what_ended_it():
@@ -35,7 +35,7 @@ def test_the_environment_of_a_stream_ends_with_it(monkeypatch):
     monkeypatch.delenv("OPTLOC_THREADS", raising=False)
     monkeypatch.setenv("OPTLOC_COMPILE", "wait")
     before = sys.getswitchinterval()
-    with _threads():
+    with _stream_environment():
         assert (os.environ["OPTLOC_THREADS"], os.environ["OPTLOC_COMPILE"]) == ("1", "wait")
         assert sys.getswitchinterval() < before
     assert "OPTLOC_THREADS" not in os.environ

@@ -577,7 +577,7 @@ def test_what_was_recorded_is_replayed_with_its_pauses(tmp_path):
 
 def test_a_site_is_read_anew_if_it_can_be(tmp_path):
     site, said, out = site_in(tmp_path), [], Answers()
-    stream = Stream(site, Settings(phases="fix", wait=10.0), out, said.append, again=tmp_path / "site.toml")
+    stream = Stream(site, Settings(phases="fix", wait=10.0), out, said.append, site_file=tmp_path / "site.toml")
 
     def again(text):
         (tmp_path / "site.toml").write_text(text)
