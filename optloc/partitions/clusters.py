@@ -14,6 +14,16 @@ from optloc.base.errors import InvalidProblem
 CONNECT = 10.0
 """Seconds to wait for a scheduler: one on the same network replies in less than one second."""
 
+# Settings of Dask for the workers of a local cluster, whose tasks take seconds and release their memory themselves.
+# By default, glibc returns each array of 128 KiB or more to the system at once, because Dask states a threshold of
+# trimming. The pages of the next arrays then take a fifth of the time of fixes. The profile, which looks at the worker
+# a hundred times a second, and the ticks of the event loop take another tenth.
+_LOCAL_WORKERS = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+}
+
 
 @contextmanager
 def dask_client(address: str | None, jobs: int) -> Iterator[Any]:
@@ -32,18 +42,14 @@ def dask_client(address: str | None, jobs: int) -> Iterator[Any]:
         If Dask is not installed, the scheduler cannot be reached, or it has no workers; also if it ends in the block.
     """
     try:
-        from distributed import CancelledError, Client, LocalCluster
+        from distributed import CancelledError, Client
         from distributed.comm import CommClosedError
     except ImportError:
         raise InvalidProblem("Dask is not installed", "--executor", "pip install 'optloc[dask]'") from None
     with ExitStack() as stack:
         try:
             with _block_ctrl_c():
-                place: Any = address
-                if place is None:
-                    # Without a page of statistics, and without warnings about workers that end with the cluster.
-                    options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-                    place = stack.enter_context(LocalCluster(n_workers=jobs, **options))
+                place: Any = stack.enter_context(_local_dask(jobs)) if address is None else address
                 client = stack.enter_context(Client(place, timeout=CONNECT))
                 count = sum(client.ncores().values())
         except (OSError, TimeoutError, ValueError) as error:
@@ -56,6 +62,19 @@ def dask_client(address: str | None, jobs: int) -> Iterator[Any]:
         except (CancelledError, CommClosedError):
             advice = "start it again, and run the same command: finished parts are kept"
             raise InvalidProblem("the scheduler has ended", address or "dask", advice) from None
+
+
+@contextmanager
+def _local_dask(jobs: int) -> Iterator[Any]:
+    """Yield a Dask cluster of `jobs` processes with one thread each, which ends with the block."""
+    import dask
+    from distributed import LocalCluster
+
+    # Without a page of statistics, and without warnings about workers that end with the cluster.
+    options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+    # The settings stay until the cluster ends: a worker that replaces a lost worker reads them when it starts.
+    with dask.config.set(_LOCAL_WORKERS), LocalCluster(n_workers=jobs, **options) as cluster:
+        yield cluster
 
 
 @contextmanager

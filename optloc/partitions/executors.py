@@ -147,6 +147,8 @@ def _finished(client: Any, futures: Iterable[Any], address: str | None) -> list[
 def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
     """Yield the results of tasks on a Ray cluster, which starts tasks of lost workers again."""
     with ray_cluster(by.address, by.jobs or thread_count()) as ray:
+        from ray.exceptions import NodeDiedError, OutOfMemoryError, WorkerCrashedError
+
         remote = ray.remote(max_retries=_DEATHS)(run_on_one_thread)
         waiting, running = iter(tasks), dict[Any, Task]()
 
@@ -160,7 +162,7 @@ def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequenc
                 hand_out(1)
                 try:
                     yield task, ray.get(future)
-                except ray.exceptions.WorkerCrashedError:
+                except (WorkerCrashedError, OutOfMemoryError, NodeDiedError):
                     yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
 
 
