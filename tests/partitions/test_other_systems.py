@@ -86,7 +86,7 @@ def test_the_recipe_of_ray_data_gives_the_fixes_and_the_schema(here):
         # Small blocks divide the readings of an event, unless they are grouped.
         ray.data.DataContext.get_current().target_max_block_size = 1000
         names: dict = {}
-        exec(recipe("import optloc, ray"), names)  # noqa: S102  (the code of the page)
+        exec(recipe("import optloc, ray"), names)
         fixes = names["fixes"].materialize()
         assert dict(zip(fixes.schema().names, map(str, fixes.schema().types), strict=True)) == {
             entry.name: str(entry.type) for entry in fix_schema("arrow")
@@ -107,7 +107,7 @@ def test_the_recipe_of_spark_gives_the_fixes(here, monkeypatch):
     spark = SparkSession.builder.master("local[2]").config(map=settings).getOrCreate()
     try:
         names = {"readings": spark.read.parquet("arrivals")}
-        exec(recipe("applyInPandas("), names)  # noqa: S102  (the code of the page)
+        exec(recipe("applyInPandas("), names)
         check(names["fixes"].toPandas(), here)
     finally:
         spark.stop()
