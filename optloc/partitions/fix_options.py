@@ -80,26 +80,23 @@ def identity_of(options: FixOptions) -> dict[str, Any]:
         release = version("optloc")
     except PackageNotFoundError:
         release = "0"
-    hints = {name: getattr(options.hints, name) for name in options.hints.__dataclass_fields__}
-    return {"version": release, "method": options.method, **_plain(hints, options)}
-
-
-def _plain(hints: Mapping[str, Any], options: FixOptions) -> dict[str, Any]:
-    """Return the values of hints and constraints as JSON values; a file is represented by its checksum."""
-    plain = partial(json.dumps, default=_text, sort_keys=True)
-    values = {name: json.loads(plain(_file_or(value))) for name, value in hints.items() if value}
+    plain = partial(json.dumps, default=_json_value, sort_keys=True)
+    values = _checksums_and_values(options.hints)
+    hints = {name: json.loads(plain(value)) for name, value in values.items() if value}
     constraints = {place: table.model_dump(mode="json", exclude_none=True) for place, table in options.more.items()}
-    return {**values, "constraint": constraints}
+    return {"version": release, "method": options.method, **hints, "constraint": constraints}
 
 
-def _file_or(value: Any) -> Any:
-    """Return the checksum of a file, or the value if it names no file."""
-    named = isinstance(value, str | Path) and len(str(value)) < 1000  # longer names are no files on any system
-    return f"checksum {digest_of(Path(value))}" if named and Path(value).is_file() else value
+def _checksums_and_values(record: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass by name; the name of a file is replaced by its checksum."""
+
+    def checksum_or_value(value: Any) -> Any:
+        named = isinstance(value, str | Path) and len(str(value)) < 1000  # longer names are no files on any system
+        return f"checksum {digest_of(Path(value))}" if named and Path(value).is_file() else value
+
+    return {name: checksum_or_value(getattr(record, name)) for name in record.__dataclass_fields__}
 
 
-def _text(value: Any) -> Any:
-    """Return a value that JSON does not have as text or as a list."""
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _file_or(getattr(value, name)) for name in value.__dataclass_fields__}
-    return str(value)
+def _json_value(value: Any) -> Any:
+    """Return a value that JSON does not have as an object of fields or as text."""
+    return _checksums_and_values(value) if hasattr(value, "__dataclass_fields__") else str(value)
