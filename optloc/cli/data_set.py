@@ -16,7 +16,7 @@ from optloc.cli.output import Screen, dumps, meter, say, write_text
 from optloc.files.constraint_table import ConstraintTable
 from optloc.partitions.executors import TaskExecutor, task_executor
 from optloc.partitions.fix_data_set import FixAccount, fix_data_set
-from optloc.partitions.one_partition import FixOptions
+from optloc.partitions.fix_options import FixOptions
 
 # Largest number of partitions on a screen. The others are counted; --json has all.
 _PARTITIONS = 12

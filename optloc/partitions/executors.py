@@ -5,7 +5,7 @@ Results come in the order of their completion. A cluster runs few tasks ahead, s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from time import monotonic
@@ -24,7 +24,6 @@ _AHEAD = 2
 _DEATHS = 3
 # Seconds between looks at the workers, and the longest time without any worker: a new one starts in some seconds.
 _LOOK, _WITHOUT_WORKERS = 5.0, 60.0
-_ENDED = "the workers of this partition ended again and again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +32,10 @@ class Died:
 
     reason: str
 
+
+_DIED = Died(
+    "the workers of this partition ended again and again; write smaller partitions, or start workers with more memory"
+)
 
 Completed = Generator[tuple[Task, Result | Died]]
 """Tasks with their results, in the order of their completion."""
@@ -90,39 +93,58 @@ def run_on_one_thread(work: Callable[[Task], Result], task: Task) -> Result:
         return work(task)
 
 
+def _submitted(
+    tasks: Iterable[Task],
+    submit: Callable[[Task], Any],
+    finished: Callable[[Iterable[Any]], Iterable[Any]],
+    processors: int,
+) -> Iterator[tuple[Task, Any]]:
+    """Yield tasks with their finished futures, while `_AHEAD` tasks for each processor run or wait.
+
+    ``submit(task)`` starts a task and returns its future. ``finished(futures)`` waits, and returns finished futures.
+    """
+    waiting, running = iter(tasks), dict[Any, Task]()
+
+    def hand_out(count: int) -> None:
+        running.update((submit(task), task) for task in islice(waiting, count))
+
+    hand_out(_AHEAD * processors)
+    while running:
+        for future in finished(running):
+            task = running.pop(future)
+            hand_out(1)
+            yield task, future
+
+
 def _run_on_dask(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
     """Yield the results of tasks on a Dask cluster, which starts tasks of lost workers again."""
     with dask_client(by.address, by.jobs or thread_count()) as client:
         from distributed import KilledWorker
 
-        waiting, running, suspects = iter(tasks), dict[Any, Task](), list[Task]()
+        suspects = list[Task]()
 
         def submit(task: Task) -> Any:
             # A task is never the same as an earlier one: the input file may have changed.
             return client.submit(run_on_one_thread, work, task, pure=False)
 
-        def hand_out(count: int) -> None:
-            running.update((submit(task), task) for task in islice(waiting, count))
+        def finished(futures: Iterable[Any]) -> list[Any]:
+            return _finished_on_dask(client, futures, by.address)
 
-        hand_out(_AHEAD * sum(client.ncores().values()))
-        while running:
-            for future in _finished(client, running, by.address):
-                task = running.pop(future)
-                hand_out(1)
-                try:
-                    yield task, future.result()
-                except KilledWorker:
-                    suspects.append(task)
-                future.release()
+        for task, future in _submitted(tasks, submit, finished, sum(client.ncores().values())):
+            try:
+                yield task, future.result()
+            except KilledWorker:
+                suspects.append(task)
+            future.release()
         # Dask also blames the tasks that waited at a lost worker, so each suspect is tried again alone.
         for task in suspects:
             try:
-                yield task, _finished(client, [submit(task)], by.address)[0].result()
+                yield task, finished([submit(task)])[0].result()
             except KilledWorker:
-                yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
+                yield task, _DIED
 
 
-def _finished(client: Any, futures: Iterable[Any], address: str | None) -> list[Any]:
+def _finished_on_dask(client: Any, futures: Iterable[Any], address: str | None) -> list[Any]:
     """Return the futures that have finished, as soon as there is one.
 
     Raises
@@ -147,21 +169,20 @@ def _finished(client: Any, futures: Iterable[Any], address: str | None) -> list[
 def _run_on_ray(by: TaskExecutor, work: Callable[[Task], Result], tasks: Sequence[Task]) -> Completed[Task, Result]:
     """Yield the results of tasks on a Ray cluster, which starts tasks of lost workers again."""
     with ray_cluster(by.address, by.jobs or thread_count()) as ray:
+        from ray.exceptions import NodeDiedError, OutOfMemoryError, WorkerCrashedError
+
         remote = ray.remote(max_retries=_DEATHS)(run_on_one_thread)
-        waiting, running = iter(tasks), dict[Any, Task]()
-
-        def hand_out(count: int) -> None:
-            running.update((remote.remote(work, task), task) for task in islice(waiting, count))
-
-        hand_out(_AHEAD * int(ray.cluster_resources().get("CPU", 1)))
-        while running:
-            for future in ray.wait(list(running))[0]:
-                task = running.pop(future)
-                hand_out(1)
-                try:
-                    yield task, ray.get(future)
-                except ray.exceptions.WorkerCrashedError:
-                    yield task, Died(f"{_ENDED}; write smaller partitions, or start workers with more memory")
+        futures = _submitted(
+            tasks,
+            lambda task: remote.remote(work, task),
+            lambda running: ray.wait(list(running))[0],
+            int(ray.cluster_resources().get("CPU", 1)),
+        )
+        for task, future in futures:
+            try:
+                yield task, ray.get(future)
+            except (WorkerCrashedError, OutOfMemoryError, NodeDiedError):
+                yield task, _DIED
 
 
 TASK_EXECUTORS: dict[str, Callable[..., Completed[Any, Any]]] = {

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,8 @@ from optloc.files.csv_formats import read_table
 from optloc.files.table import Table
 from optloc.partitions.event_index import EventIndex, event_hashes
 from optloc.partitions.executors import TaskExecutor
-from optloc.partitions.fixed_columns import fix_schema
+from optloc.partitions.fix_options import FixOptions, check_shared, identity_of
+from optloc.partitions.fixed_columns import arrow_of
 from optloc.partitions.journal import (
     KEPT,
     FinishedPartition,
@@ -33,7 +32,7 @@ from optloc.partitions.journal import (
     locked_output,
     partition_names,
 )
-from optloc.partitions.one_partition import FixOptions, check_shared, fix_rows_labelled
+from optloc.partitions.one_partition import fix_rows_labelled
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +124,7 @@ def fix_data_set(
     check_shared(options.hints)
     names = partition_names(folder)
     with locked_output(out, folder), access() as allowed:
-        journal = Journal(out, _identity(options))
+        journal = Journal(out, identity_of(options))
         done = [name for name in names if journal.is_done(name, folder)]
         index, failed = EventIndex(), dict[str, str]()
         for name in done:
@@ -175,15 +174,12 @@ def _with_folder_keys(table: Table, task: PartitionTask) -> Table:
 
 def _write(path: Path, frame: Any) -> str:
     """Write fixes as a Parquet file, completely or not at all, and return its checksum."""
-    import pyarrow as pa
     from pyarrow import parquet
 
     scratch = path.with_name(f".optloc-{secrets.token_hex(8)}.parquet")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        table = pa.Table.from_pandas(frame, schema=fix_schema("arrow"), preserve_index=False)
-        # Without the description of pandas, which names its version: files of all workers are equal.
-        parquet.write_table(table.replace_schema_metadata(), scratch, compression="zstd")
+        parquet.write_table(arrow_of(frame), scratch, compression="zstd")
         digest = digest_of(scratch)
         scratch.replace(path)
     except OSError as error:
@@ -217,36 +213,3 @@ def _check_events(index: EventIndex, one: FinishedPartition, events: Array, out:
             what = f"the event {common[0][0]!r} is in both partitions"
             advice = "write all readings of an event to one file, or join columns: --column message=day+id"
             raise InvalidProblem(what, f"{first} and {second}", advice)
-
-
-def _identity(options: FixOptions) -> dict[str, Any]:
-    """Return everything on which fixes depend as a JSON value; files are represented by their checksums."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        release = version("optloc")
-    except PackageNotFoundError:
-        release = "0"
-    hints = {name: getattr(options.hints, name) for name in options.hints.__dataclass_fields__}
-    return {"version": release, "method": options.method, **_plain(hints, options)}
-
-
-def _plain(hints: Mapping[str, Any], options: FixOptions) -> dict[str, Any]:
-    """Return the values of hints and constraints as JSON values; a file is represented by its checksum."""
-    plain = partial(json.dumps, default=_text, sort_keys=True)
-    values = {name: json.loads(plain(_file_or(value))) for name, value in hints.items() if value}
-    constraints = {place: table.model_dump(mode="json", exclude_none=True) for place, table in options.more.items()}
-    return {**values, "constraint": constraints}
-
-
-def _file_or(value: Any) -> Any:
-    """Return the checksum of a file, or the value if it names no file."""
-    named = isinstance(value, str | Path) and len(str(value)) < 1000  # longer names are no files on any system
-    return f"checksum {digest_of(Path(value))}" if named and Path(value).is_file() else value
-
-
-def _text(value: Any) -> Any:
-    """Return a value that JSON does not have as text or as a list."""
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _file_or(getattr(value, name)) for name in value.__dataclass_fields__}
-    return str(value)

@@ -99,3 +99,12 @@ def frame_of(columns: Mapping[str, Any], count: int) -> pd.DataFrame:
         for name, kind in FIX_COLUMNS.items()
     }
     return pd.DataFrame(found)
+
+
+def arrow_of(frame: pd.DataFrame) -> Any:
+    """Return fixes in the fixed schema as a table of pyarrow; missing numbers are null."""
+    import pyarrow as pa
+
+    table = pa.Table.from_pandas(frame, schema=_arrow(), preserve_index=False)
+    # Without the description of pandas, which names its version: files of all workers are equal.
+    return table.replace_schema_metadata()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -124,21 +125,16 @@ class Journal:
         self.finished: dict[str, FinishedPartition] = {}
         header = json.loads(json.dumps({"format": _FORMAT, **options}))
         try:
-            lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
-            # A killed run may leave a part of a line at the end.
-            complete = [line for line in lines if line.endswith(b"\n")]
-            if complete != lines:
-                with self.path.open("r+b") as file:
-                    file.truncate(sum(map(len, complete)))
+            lines = _complete_lines(self.path)
             for scratch in folder.rglob(".optloc-*"):
                 scratch.unlink(missing_ok=True)
         except OSError as error:
             raise unwritable_folder(folder, error, KEPT) from None
-        if not complete:
+        if not lines:
             self._append(header)
             return
         try:
-            found, *records = (json.loads(line) for line in complete)
+            found, *records = (json.loads(line) for line in lines)
             self.finished = {one.name: one for one in (FinishedPartition(**record) for record in records)}
         except (ValueError, TypeError):
             raise InvalidProblem("the journal is damaged", str(self.path), "name another folder after --out") from None
@@ -154,8 +150,6 @@ class Journal:
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Append a line, and wait until the disk has it; raise InvalidProblem if this fails."""
-        import os
-
         try:
             with self.path.open("ab") as file:
                 file.write(json.dumps(record).encode() + b"\n")
@@ -174,3 +168,13 @@ class Journal:
             return fixes.is_file() and digest_of(fixes) == one.fixes and digest_of(data_set / name) == one.source
         except InvalidProblem:
             return False
+
+
+def _complete_lines(path: Path) -> list[bytes]:
+    """Return the complete lines of a journal, and remove the part of a line that a killed run has left at the end."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    complete = [line for line in lines if line.endswith(b"\n")]
+    if complete != lines:
+        with path.open("r+b") as file:
+            file.truncate(sum(map(len, complete)))
+    return complete

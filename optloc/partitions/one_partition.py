@@ -3,68 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Stations, Status
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Status
 from optloc.files.columns import PLACE
-from optloc.files.constraint_table import ConstraintTable, constraint_of_text
+from optloc.files.constraint_table import constraint_of_text
 from optloc.files.convert import interpret_table
-from optloc.files.measurements import ESTIMATE
 from optloc.files.reader import Loaded
 from optloc.files.roles import Roles
 from optloc.files.shapes import events_of_rows
-from optloc.files.stations import station_table
 from optloc.files.table import Table, of_arrow
-from optloc.files.table_import import ColumnHints, NoReading, without_ignored_columns
-from optloc.files.wave_speed import WaveOptions
+from optloc.files.table_import import NoReading, without_ignored_columns
 from optloc.partitions.epoch_fixes import fix_columns, fix_epochs, solve_floors
-from optloc.partitions.fixed_columns import frame_of
+from optloc.partitions.fix_options import FixOptions, check_shared, hints_of
+from optloc.partitions.fixed_columns import arrow_of, frame_of
 from optloc.problem.epochs import separable
 from optloc.show.columns import Columns
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Frame = TypeVar("Frame")
+"""A pandas data frame, or a table of pyarrow."""
+
 # The reason of an event in which each receiver is missing.
 _NO_READING = "the event has no reading"
 
 
-# Options on the wave by field of `WaveOptions`.
-_WAVES = {"wave_speed": "speed", "wind": "wind", "two_way": "two_way", "turn_around": "turn_around"}
-
-
-@dataclass(frozen=True, slots=True)
-class FixOptions:
-    """Options that all partitions of a data set share.
-
-    Parameters
-    ----------
-    hints : ColumnHints
-        Facts that the tables do not contain.
-    method : str
-        Method as in `optloc.solve`.
-    more : mapping of str to ConstraintTable
-        Constraints by the name of their option.
-    """
-
-    hints: ColumnHints
-    method: str = "auto"
-    more: Mapping[str, ConstraintTable] = field(default_factory=dict)
-
-
 def fix_table(
-    frame: pd.DataFrame,
+    frame: Frame,
     stations: Any = None,
     *,
     method: str = "auto",
     constraints: Sequence[str] = (),
     **options: Any,
-) -> pd.DataFrame:
+) -> Frame:
     """Return the fixes of a table of readings, one row for each event, with the schema `optloc.partitions.fix_schema`.
 
     Each partition of a data set gives a table with the same columns and types, also an empty partition. So Dask, Ray
@@ -72,8 +49,9 @@ def fix_table(
 
     Parameters
     ----------
-    frame : pandas.DataFrame
-        Readings: one in each row, with a column of events; or a column for each receiver. Missing readings are NaN.
+    frame : pandas.DataFrame or pyarrow.Table
+        Readings: one in each row, with a column of events; or a column for each receiver. Missing readings are NaN or
+        null.
     stations : path, pandas.DataFrame, mapping of name to coordinates, or Stations, optional
         Station positions, as in `optloc.load_table` or `optloc.locate`; by default from the table itself.
     method : str
@@ -87,9 +65,9 @@ def fix_table(
 
     Returns
     -------
-    pandas.DataFrame
-        Metres, seconds and degrees; NaN marks a missing number. An event without a reading has the status "too few
-        rows". The index of `frame` is not used.
+    pandas.DataFrame or pyarrow.Table
+        As `frame`. Metres, seconds and degrees; NaN marks a missing number, null in a table of pyarrow. An event
+        without a reading has the status "too few rows". The index of `frame` is not used.
 
     Raises
     ------
@@ -110,44 +88,15 @@ def fix_table(
 
     texts = {f"constraints, item {i + 1}": text for i, text in enumerate(constraints)}
     more = {place: constraint_of_text(text, place) for place, text in texts.items()}
+    given: Any = frame
     try:
-        readings = pa.Table.from_pandas(frame, preserve_index=False)
+        readings = given if isinstance(given, pa.Table) else pa.Table.from_pandas(given, preserve_index=False)
     except (pa.ArrowException, TypeError, ValueError, AttributeError) as error:
         what = f"the table cannot be read ({str(error).splitlines()[0]})"
         raise InvalidProblem(what, "frame", "give a data frame with columns of numbers, dates or text") from None
     options_of_all = FixOptions(hints_of(stations, options), method, more)
-    return fix_rows_labelled(of_arrow(readings, "frame"), Path("frame"), options_of_all)[0]
-
-
-def hints_of(stations: Any, options: Mapping[str, Any]) -> ColumnHints:
-    """Return the hints for stations in any accepted form, and for further fields of `ColumnHints` by name."""
-    other = ("stations", "times", "navigation", "wave")
-    known = [*(name for name in ColumnHints.__dataclass_fields__ if name not in other), *_WAVES]
-    unknown = next((name for name in options if name not in known), None)
-    if unknown is not None:
-        raise InvalidProblem(f"there is no option {unknown!r}", unknown, nearest(unknown, known))
-    wave = WaveOptions(**{_WAVES[name]: value for name, value in options.items() if name in _WAVES})
-    options = {name: value for name, value in options.items() if name not in _WAVES} | {"wave": wave}
-    if isinstance(stations, str | Path):
-        return ColumnHints(stations=Path(stations), **options)
-    if stations is None:
-        return ColumnHints(**options)
-    named = isinstance(stations, Stations | Mapping) or hasattr(stations, "columns")
-    if not named:
-        raise InvalidProblem("the stations have no names", "stations", "give a mapping, a data frame or a file")
-    return ColumnHints(stations=station_table(stations, "stations"), **options)
-
-
-def check_shared(hints: ColumnHints) -> None:
-    """Raise InvalidProblem for options whose result depends on the other events of a partition."""
-    if hints.window is not None:
-        advice = "give each event an identifier, and state its column with --column message=NAME"
-        raise InvalidProblem("each partition would begin with a new window", "--window", advice)
-    if hints.still:
-        raise InvalidProblem("a partition has many events", "--still", "use this option for one file")
-    if hints.sigma is not None and ESTIMATE in hints.sigma:
-        advice = "estimate it for one file with optloc fix, and state the number"
-        raise InvalidProblem("each partition would have another sigma", "--sigma", advice)
+    fixes: Any = fix_rows_labelled(of_arrow(readings, "frame"), Path("frame"), options_of_all)[0]
+    return arrow_of(fixes) if readings is given else fixes  # type: ignore[no-any-return]
 
 
 def fix_rows_labelled(table: Table, source: Path, options: FixOptions) -> tuple[pd.DataFrame, bool]:

@@ -77,15 +77,13 @@ def test_ray_that_is_not_installed_is_one_sentence():
 
 
 @pytest.mark.slow
-def test_ray_gives_the_same_results():
-    pytest.importorskip("ray")
-    assert sorted(TaskExecutor("ray", 2).run(square, FEW)) == [(i, i * i) for i in FEW]
-
-
-@pytest.mark.slow
-def test_dask_gives_the_same_results_survives_a_lost_worker_and_reports_a_fatal_task(tmp_path, importable):
-    pytest.importorskip("distributed")
-    by = TaskExecutor("dask", 2)
+@pytest.mark.parametrize(("name", "package"), [("dask", "distributed"), ("ray", "ray")])
+def test_clusters_give_the_same_results_survive_a_lost_worker_and_report_a_fatal_task(
+    tmp_path, importable, name, package
+):
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    by = TaskExecutor(name, 2)
     assert sorted(by.run(square, FEW)) == [(i, i * i) for i in FEW]
     assert {count for _, count in by.run(threads, FEW)} == {1}
     tasks = [(tmp_path, number) for number in FEW]

@@ -1,7 +1,11 @@
 """Data sets: partitions in and out, a stopped run continues, and an event in two partitions is found."""
 
+import importlib.util
 import json
+import os
 import shutil
+import signal
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +17,9 @@ from optloc import InvalidProblem, fix_table
 from optloc.files.table_import import ColumnHints
 from optloc.partitions import fix_data_set as module
 from optloc.partitions.executors import Died, TaskExecutor
-from optloc.partitions.fix_data_set import fix_data_set
+from optloc.partitions.fix_data_set import fix_data_set, fix_partition
+from optloc.partitions.fix_options import FixOptions
 from optloc.partitions.journal import JOURNAL
-from optloc.partitions.one_partition import FixOptions
 
 HERE = TaskExecutor()
 
@@ -187,10 +191,27 @@ def test_a_worker_that_is_killed_in_the_middle_changes_nothing(tmp_path):
     assert tables(tmp_path / "two") == tables(tmp_path / "one")
 
 
-@pytest.mark.slow
-def test_dask_writes_the_same_bytes(data, tmp_path):
-    pytest.importorskip("distributed")
-    folder, sites = data
+def fix_or_die(task):
+    """Fix a partition; the first worker that fixes partition 1 ends without a reply after its file is complete."""
+    result, mark = fix_partition(task), task.folder.parent / "died"
+    if task.name == "part-1.parquet" and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("dask", "distributed"), pytest.param("ray", "ray", marks=pytest.mark.slow)]
+)
+def test_a_cluster_that_loses_a_worker_writes_the_same_bytes(tmp_path, monkeypatch, name, package):
+    """`test_a_worker_that_is_killed_in_the_middle_changes_nothing` and the benchmark have larger data sets."""
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))  # of Ray's workers
+    folder, sites = write(tmp_path / "readings", 6)
     fix_data_set(folder, tmp_path / "one", options_of(sites), HERE)
-    fix_data_set(folder, tmp_path / "two", options_of(sites), TaskExecutor("dask", 2))
+    monkeypatch.setattr(module, "fix_partition", fix_or_die)
+    account = fix_data_set(folder, tmp_path / "two", options_of(sites), TaskExecutor(name, 2))
+    assert (tmp_path / "died").exists()
+    assert (len(account.finished), account.failed) == (6, {})
     assert tables(tmp_path / "two") == tables(tmp_path / "one")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from partitions.scenes import SIGMA, STATIONS, arrivals, wide
 
@@ -37,6 +38,16 @@ def test_a_wide_table_agrees_with_locate_and_missing_receivers_are_nan():
     assert lost["reason"].tolist() == ["the event has no reading"]
     assert lost["x"].isna().all()
     assert (len(fixes), fixes["dof"].tolist()) == (8, [4, 4, 3, 4, 4, 4, 4, 0])
+
+
+def test_a_table_of_arrow_gives_a_table_of_arrow():
+    table, _ = arrivals(0, 4)
+    found = fix_table(pa.Table.from_pandas(table), STATIONS, sigma=SIGMA)
+    assert found.schema == fix_schema("arrow")
+    known = fix_table(table, STATIONS, sigma=SIGMA)
+    assert found["x"].to_pylist() == known["x"].tolist()
+    assert found["z"].null_count == 4
+    assert found["status"].to_pylist() == known["status"].tolist()
 
 
 @pytest.mark.parametrize("rows", [0, 1, 6, 7])
