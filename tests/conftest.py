@@ -1,5 +1,6 @@
 """What all tests share: where the real data is, reproducible property tests, and seeds that a run may choose."""
 
+import gc
 import os
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OPTLOC_THREADS", "1")
 # What tests begin is the optloc that they test, not a checkout in the current folder, which has no machine code.
 os.environ["PYTHONSAFEPATH"] = "1"
+
+# Searches for garbage among a million objects of collected tests, which live until the end, take half of the collection.
+gc.disable()
 
 # The command line is put together once, not for each of a thousand commands.
 typer.testing._get_command = cache(typer.testing._get_command)
@@ -52,6 +56,16 @@ def pytest_sessionstart(session):
     if enabled() and missing():
         with meter("making machine code", quiet=False) as tell:
             make(tell)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Let no later search for garbage look at what was collected: it lives until the end."""
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_generate_tests(metafunc):

@@ -3,19 +3,24 @@
 import numpy as np
 import pytest
 from proof.costs import NO_REGION, beside, combined, differences, random_case
+from proof.sampling import many
 
 from optloc.kernels.jit import enabled
 from optloc.proof.local_search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove_locally
 from optloc.proof.search_space import cost_of, empty_box
 
-# A form of the search that these tests alone call is made for them.
-pytestmark = pytest.mark.slow
-CASES, BUDGET_HERE = (12, 20_000) if enabled() else (3, 300)
+# As Python: fixes call other searches, so machine code of this one would be made for these tests alone.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("form")]
 KAPPAS = (0.0, 9.0, 25.0)
 AROUND, AWAY = 1e5, 1e9
 
 
-def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed=False):
+def cases():
+    """Return how many costs are drawn."""
+    return many(12, 3)
+
+
+def proof(case, x, kappa=0.0, others=(), region=None, budget=None, closed=False):
     """Return verdict, boxes, bound and the point found."""
     d, found = case.d, np.full(case.d, np.nan)
     low, high = (NO_REGION[:d], NO_REGION[:d]) if region is None else (np.asarray(end, float) for end in region)
@@ -23,6 +28,7 @@ def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed
     eps = 1e-6 * (1.0 + case.cost(x))
     K = np.ascontiguousarray(case.K)
     cost, box = cost_of(case.kinds, case.data, K, case.w), empty_box(*K.shape)
+    budget = budget or many(20_000, 300)
     answer = prove_locally(cost, box, x, known, kappa, eps, budget, np.inf, low, high, closed, found)
     return *answer, found
 
@@ -38,7 +44,7 @@ def gradient_in_deviations(case, x):
 def test_what_is_proven_holds_against_many_starts(d, kind):
     rng = np.random.default_rng(d)
     proven = 0
-    for i in range(CASES):
+    for i in range(cases()):
         case, _ = random_case(rng, d, kind=kind, outside=i % 2 == 1, sigma=(1.0, 10.0, 30.0)[i % 3])
         minima = case.minima(rng)
         if not len(minima):
@@ -59,14 +65,14 @@ def test_what_is_proven_holds_against_many_starts(d, kind):
                 assert 0.0 <= case.cost(found) - costs[0] < kappa
                 assert gradient_in_deviations(case, found) < 0.1
                 assert np.linalg.norm(found - minima[0]) > 1.0
-    assert proven > 0.8 * CASES
+    assert proven > 0.8 * cases()
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_minima_that_are_not_the_least_are_refuted_or_left_open(d):
     rng = np.random.default_rng(10 + d)
     tried = refuted = 0
-    for i in range(2 * CASES):
+    for i in range(2 * cases()):
         case, _ = random_case(rng, d, m=d + 2, outside=i % 2 == 1, sigma=30.0)
         minima = case.minima(rng)
         for wrong in minima[1:]:
@@ -84,13 +90,13 @@ def test_minima_that_are_not_the_least_are_refuted_or_left_open(d):
                 if verdict == BETTER:
                     refuted += kappa == 0.0
                     assert case.cost(found) < case.cost(wrong)
-    assert tried >= CASES // 4
+    assert tried >= cases() // 4
     assert refuted > 0.9 * tried or not enabled()
 
 
 def test_points_that_are_no_minima_are_not_certified():
     rng = np.random.default_rng(20)
-    for _ in range(CASES):
+    for _ in range(cases()):
         case, truth = random_case(rng, 3, sigma=10.0)
         sigma = np.linalg.inv(np.linalg.cholesky(case.derivatives(truth)[1])).T
         x = case.minimum(truth) + sigma @ rng.standard_normal(3)
@@ -122,7 +128,7 @@ def test_a_mirror_twin_has_the_proven_value_and_is_found(kappa):
 def test_other_minima_that_are_known_are_set_aside_and_the_list_is_proven():
     rng = np.random.default_rng(40)
     listed = 0
-    for _ in range(2 * CASES):
+    for _ in range(2 * cases()):
         stations = np.array([[-4e3, 0.0], [0.0, 150.0], [4e3, -200.0]]) + 300.0 * rng.standard_normal((3, 2))
         truth = np.array([2e3, 3e3]) + 1e3 * rng.standard_normal(2)
         case = combined(stations, np.eye(3), 100.0**2 * np.eye(3), truth, rng)
@@ -142,7 +148,7 @@ def test_other_minima_that_are_known_are_set_aside_and_the_list_is_proven():
 def test_a_region_is_searched_where_nothing_encloses_the_cost():
     rng = np.random.default_rng(50)
     done = 0
-    for _ in range(CASES):
+    for _ in range(cases()):
         stations = rng.uniform(-5e3, 5e3, (4, 3))
         truth = rng.uniform(-2e3, 2e3, 3)
         case = differences(stations, truth, 10.0, rng)
@@ -165,7 +171,7 @@ def test_a_region_whose_least_cost_is_on_its_border_is_not_proven():
     """The fix has a low cost, but the region reaches to where the cost is lower still, without a minimum inside."""
     rng = np.random.default_rng(60)
     seen = 0
-    for _ in range(8 * CASES):
+    for _ in range(8 * cases()):
         case, _ = random_case(rng, 2, m=4, sigma=30.0)
         minima = case.minima(rng)
         if len(minima) < 2 or case.cost(minima[1]) > case.cost(minima[0]) + 400.0:
@@ -187,7 +193,7 @@ def test_a_region_whose_least_cost_is_on_its_border_is_not_proven():
 
 def test_a_budget_that_ends_leaves_a_valid_bound():
     rng = np.random.default_rng(70)
-    for _ in range(CASES):
+    for _ in range(cases()):
         case, _ = random_case(rng, 3, m=6, outside=True, sigma=30.0)
         minima = case.minima(rng)
         if not len(minima):

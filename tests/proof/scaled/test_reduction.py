@@ -21,7 +21,6 @@ from optloc.proof.search_space import chart_at
 from optloc.solvers.certificates.position_cost import matches_problem_cost
 
 PRIORS = [0.02, 0.1, 0.3, None]
-COUNT = many(60, 3)
 
 
 def scenes(rng, d):
@@ -97,13 +96,13 @@ class Look:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_no_point_of_a_box_is_below_its_bound(d, seed):
+def test_no_point_of_a_box_is_below_its_bound(d, seed, form):
     """Bounds, the range of the factor and clipped boxes hold at random points and corners."""
-    rng = np.random.default_rng([seed, d])
+    rng, count = np.random.default_rng([seed, d]), many(60, 3)
     said = 0
     for scene in scenes(rng, d):
         look = Look(scene)
-        for _ in range(COUNT):
+        for _ in range(count):
             piece, at, half = look.draw(rng)
             box, sheet = look.fill(piece, at, half), look.tables.sheet
             inside = half * np.concatenate(
@@ -123,19 +122,26 @@ def test_no_point_of_a_box_is_below_its_bound(d, seed):
             clip_rows(look.scaled, np.sqrt(level), box, sheet)
             kept = ((inside >= box.cut[:3] - 1e-12) & (inside <= box.cut[3:] + 1e-12)).all(1)
             assert kept[low].all()
-    assert said > COUNT
+    assert said > count
+
+
+@pytest.fixture
+def solved(d, seed):
+    """Return a generator, and scenes with their fixes; a test names it before `form`, so that machine code solves."""
+    rng = np.random.default_rng([seed, 7, d])
+    return rng, [(scene, solve(scene.problem)) for scene in scenes(rng, d)]
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, seed):
+def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, solved, form):
     """A minimum stays in what is left of a box; midpoints in convex boxes cost no more than the mean of the ends."""
-    rng = np.random.default_rng([seed, 7, d])
+    rng, count = solved[0], many(60, 3)
     convex = clipped = 0
-    for scene in scenes(rng, d):
-        look, fix = Look(scene), solve(scene.problem)
+    for scene, fix in solved[1]:
+        look = Look(scene)
         if not (fix.answered and look.set_minimum(fix.position, float(fix.cost) + 25.0)):
             continue
-        for _ in range(COUNT):
+        for _ in range(count):
             at, half = np.zeros(3), np.zeros(3)
             half[:d] = 10.0 ** rng.uniform(-3.0, 1.5, d)  # standard deviations
             at[:d] = rng.uniform(-0.999, 0.999, d) * half[:d]
@@ -154,8 +160,8 @@ def test_minima_are_never_clipped_and_convex_boxes_are_convex(d, seed):
                 cost, _ = profiled(scene, look.places(2 * d + 1, at, half * rng.uniform(-1, 1, (40, 3))))
                 assert (cost >= fix.cost - 1e-6 * (1.0 + fix.cost)).all()
                 _is_jointly_convex(scene, look, at, half, rho**2, rng)
-    assert convex > COUNT // 2
-    assert clipped > COUNT // 2
+    assert convex > count // 2
+    assert clipped > count // 2
 
 
 def _is_jointly_convex(scene, look, at, half, level, rng):
