@@ -68,7 +68,7 @@ def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     if len(times) < _STEP_TIMES:
         return
     cuts = times[np.unique(np.linspace(1, len(times) - 1, min(len(times) - 1, _CUTS)).round().astype(int))]
-    for station, kind in suspects.first(_STEPPED):
+    for station, kind, x, least in suspects.possible(_STEPPED):
         own = case.coefficients("station", "offset", kind, case.names[station])
         for cut in cuts.tolist():
             column = own * (case.when >= cut)
@@ -79,9 +79,10 @@ def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
                 (case.names[station],),
                 columns=(ErrorColumn("adds", column),),
                 starts=((0.0,),),
-                x=suspects.start(station, kind),
+                x=x,
                 alternatives=suspects.count * len(cuts),
                 kind=kind,
+                least=least,
             )
 
 
@@ -117,10 +118,12 @@ def _rotation_words(case: MisfitCase, name: str, theta: Array, sigma: Array) -> 
 
 
 def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
-    for station, kind in suspects.first(_TRIED):
+    for station, kind, x, least in suspects.possible(_TRIED):
         if FORMS[form].enters == "scales" and MODELS[kind].period is not None:
             continue
         own = case.coefficients("station", form, kind, case.names[station])  # type: ignore[arg-type]
+        if FORMS[form].enters == "scales" and (own != 0.0).all():
+            continue  # a scale of all rows is another speed of the wave
         column = own * (case.when if FORMS[form].rate else np.ones_like(case.when))
         words = partial(station_words, case, form, kind, case.names[station])
         yield Change(
@@ -128,14 +131,15 @@ def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> It
             words,
             (case.names[station],),
             columns=(ErrorColumn(enters, column),),  # type: ignore[arg-type]
-            x=suspects.start(station, kind),
+            x=x,
             alternatives=suspects.count,
+            least=least,
         )
 
 
 def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the opposite sign of the values of single stations."""
-    for station, kind in suspects.first(_TRIED):
+    for station, kind, x, least in suspects.possible(_TRIED):
         rows = case.rows_at(station) & case.rows_of(kind)
         if MODELS[kind].ranges != (1, -1) and not MODELS[kind].emission and MODELS[kind].period is None:
             continue
@@ -148,8 +152,9 @@ def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
             (case.names[station],),
             factor=np.where(rows, -1.0, 1.0),
             shift=_turned_back(case, rows),
-            x=suspects.start(station, kind),
+            x=x,
             alternatives=suspects.count,
+            least=least,
         )
 
 
@@ -186,7 +191,9 @@ def periods(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
                 words = partial(_period_words, case, change.station[0], kind, count, name, count * length)
                 choices = suspects.count * len(table) * (2 * _MULTIPLES if MODELS[kind].quantity == "length" else 1)
                 shift = -count * length * column
-                yield Change("period", words, change.station, shift=shift, x=change.x, alternatives=choices)
+                yield replace(
+                    change, cause="period", words=words, shift=shift, columns=(), starts=(), alternatives=choices
+                )
 
 
 def _period_words(
@@ -262,6 +269,7 @@ def moves(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
             starts=start,
             x=suspects.start(station, kind),
             alternatives=len(case.stations),
+            least=suspects.least_of(station),
         )
 
 
