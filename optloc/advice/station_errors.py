@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording
 from optloc.advice.suspects import Suspects
-from optloc.advice.wording import bias_lines, quoted, size_text, station_words, unit_of
+from optloc.advice.wording import bias_lines, quoted, size_text, station_lines, station_words, unit_of
 from optloc.base.types import Array, CompassRows
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
@@ -219,12 +219,17 @@ def exchanges(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
         order = np.arange(case.base.stations.count)
         order[[i, j]] = j, i
         names = (case.names[i], case.names[j])
-        yield Change("swapped", partial(_exchange_words, names), names, position=place[:, order], alternatives=choices)
+        yield Change(
+            "swapped", partial(_exchange_words, case, (i, j)), names, position=place[:, order], alternatives=choices
+        )
 
 
-def _exchange_words(names: tuple[str, str], theta: Array, sigma: Array) -> Wording:
+def _exchange_words(case: MisfitCase, pair: tuple[int, int], theta: Array, sigma: Array) -> Wording:
+    place, names = case.base.stations.places, [case.names[i] for i in pair]
+    lines = station_lines(case, {one: place[other] for one, other in zip(pair, pair[::-1], strict=True)})
     seen = f"the values fit if the stations {names[0]} and {names[1]} are exchanged"
-    return Wording(seen, f"exchange the positions of {names[0]} and {names[1]}, or their names in the measurements")
+    advice = f"exchange the positions of {names[0]} and {names[1]}, or their names in the measurements"
+    return Wording(seen, advice, lines)
 
 
 def references(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
@@ -278,4 +283,5 @@ def _move_words(case: MisfitCase, station: int, theta: Array, sigma: Array) -> W
     text = ", ".join(f"{v:.6g}" for v in place)
     away = f"{np.linalg.norm(theta):.4g} m away from its stated position"
     seen = f"the values fit if station {case.names[station]} is {away}"
-    return Wording(seen, f"check its coordinates; the values give ({text}) m, in the axes of the problem")
+    advice = f"check its coordinates; the values give ({text}) m, in the axes of the problem"
+    return Wording(seen, advice, station_lines(case, {station: place}, float(sigma.min())))
