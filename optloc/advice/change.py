@@ -87,7 +87,7 @@ class Change:
     base : Problem, optional
         Problems (K,) of another structure, to which the change applies instead.
     least : float
-        Cost below which no fit of the change is: that of the rows which the change does not affect.
+        Cost of the rows that the change does not affect, which no fit of the change can lower.
     admits : callable, optional
         Returns whether estimates (q,) are values that the cause can have. By default, all are.
     """

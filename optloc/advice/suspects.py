@@ -102,7 +102,7 @@ class Suspects:
 
     @cached_property
     def fits(self) -> Fits | None:
-        """Return the fits of these offsets; None if there are none."""
+        """Return the fits of these offsets; None without offsets."""
         return fit(self.case, self.offsets) if self.offsets else None
 
     @cached_property
