@@ -35,7 +35,7 @@ def test_a_bias_has_the_lines_of_a_file():
     [
         (1.0, ("x", "y"), 0.0, "x = 10.0, y = -20.5 "),
         (1000.0, ("x", "y"), 0.0, "x = 0.01, y = -0.0205 "),
-        (1.0, ("x", "y"), 30.0, "x = 10.0, y = -20.0 "),
+        (1.0, ("x", "y"), 3000.0, "x = 10.0, y = -20.0 "),
     ],
 )
 def test_rows_of_stations_are_in_the_unit_of_the_file(unit, keys, sigma, row):

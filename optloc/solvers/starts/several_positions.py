@@ -27,8 +27,8 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """Return starting vectors (N, C, size) for a flat batch of problems with several targets or epochs.
 
     A state that its rows do not determine starts from its prior, if it has one. The first vector uses all rows as if no
-    bias affected them. If biases affect a part of the rows, a second vector uses the others. A large error of one station
-    moves the positions of the first vector, so that its descent can miss the best minimum.
+    bias affected them. If biases affect a part of the rows, a second vector uses the others. A large error of one
+    station moves the positions of the first vector, so that its descent can miss the best minimum.
 
     Parameters
     ----------
