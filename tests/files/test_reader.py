@@ -55,7 +55,7 @@ def test_kilometres_and_sound(tmp_path):
     assert (problem.written.place_unit, problem.written.place_keys) == (1e3, ("x", "y", "z"))
 
 
-@pytest.mark.parametrize("more", [", sigma = 1.0", ", vx = 0.0, vy = 0.0"])
+@pytest.mark.parametrize("more", [", sigma = 1.0", ", vx = 0.0, vy = 0.0, vz = 0.0"])
 def test_rows_of_stations_with_more_than_coordinates_have_no_known_keys(more, tmp_path):
     text = tdoa(extra="arrival_sigma = 3.0\n").replace(" }", f"{more} }}", len(STATIONS))
     assert load(write(tmp_path, text)).written.place_keys == ()
