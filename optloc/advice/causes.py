@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 
 from optloc.advice.change import Change, MisfitCase, Wording
+from optloc.advice.comparison import Comparison, compare_all
 from optloc.advice.explanation_table import EXPLANATIONS, LATE_PRICE
 from optloc.advice.fits import Fits, fit, is_out_of_reach
 from optloc.advice.rows_and_noise import late_fit, late_words
-from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level, scored
-from optloc.advice.suspects import Suspects
+from optloc.advice.scores import GAP, Scored, price_of_parameters, score_of_level
 from optloc.advice.wording import no_words
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
@@ -24,8 +24,6 @@ from optloc.solvers.solution import solve
 _CHEAPEST = 2.0
 # Largest number of causes that are listed if the data do not decide.
 _LISTED = 3
-# Number of epochs in which other readings are compared first, and the number of readings that are compared in all.
-_FIRST_EPOCHS, _KEPT = 2, 8
 # Relative difference of the costs of equal explanations: rounding, and the end of the descents.
 _EQUAL = 1e-3
 
@@ -44,9 +42,14 @@ def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
         cost = _cost_at(case, case.x)
     if cost < GAP + _CHEAPEST or dof < 1:
         return ()
-    case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x))
-    found = all_scores(case)
-    found += [_of_level(case, plain, cost, dof), *_of_late_rows(case)] if np.isfinite(cost) else []
+    case = replace(case, x=np.where(np.isfinite(plain.x[0]), plain.x[0], case.x), cost=plain.cost[0])
+    comparison = Comparison(case, cost)
+    if np.isfinite(cost):
+        comparison.add([_of_level(case, plain, cost, dof)])
+    compare_all(comparison)
+    if np.isfinite(cost):
+        comparison.add(_of_late_rows(case))
+    found = comparison.found
     if not found:
         return ()
     found.sort(key=lambda one: one.score)
@@ -67,59 +70,6 @@ def _cost_at(case: MisfitCase, x: Array) -> float:
         return np.inf
     cost = float(equations_at(case.base, x).cost.sum())
     return cost if np.isfinite(cost) else np.inf
-
-
-def all_scores(case: MisfitCase) -> list[Scored]:
-    """Return the scores of all changes of all explanations."""
-    suspects, changes, odds = Suspects(case), [], []
-    for entry in list(EXPLANATIONS.values()):
-        for change in entry.changes(case, suspects):
-            changes.append(change)
-            odds.append(entry.price)
-    out = []
-    fitted = {id(change) for change in suspects.offsets}
-    own = [i for i, change in enumerate(changes) if change.base is None and id(change) not in fitted]
-    own = _promising(case, changes, own)
-    if suspects.offsets:
-        price = EXPLANATIONS["offset"].price
-        out += scored(case, list(suspects.offsets), suspects.fits, [price] * len(suspects.offsets))
-    if own:
-        some = [changes[i] for i in own]
-        out += scored(case, some, fit(case, some), [odds[i] for i in own])
-    for i, change in enumerate(changes):
-        if change.base is not None:
-            other = _in_base(case, change)
-            out += scored(other, [change], fit(other, [change]), [odds[i]])
-    return out
-
-
-def _in_base(case: MisfitCase, change: Change) -> MisfitCase:
-    """Return the case in the structure that a change states."""
-    assert change.base is not None
-    x = np.zeros((len(case.times), change.base.layout.size))
-    new, old = change.base.layout, case.base.layout
-    for slot in old.shared:
-        there, _ = new.find(slot.name)
-        size = min(slot.size, there.size)
-        x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
-    x[:, new.n_shared :] = case.x[:, old.n_shared :]
-    return replace(case, base=change.base, x=x)
-
-
-def _promising(case: MisfitCase, changes: Sequence[Change], numbers: list[int]) -> list[int]:
-    """Return the numbers of the changes without the readings that a few epochs exclude."""
-    readings = [i for i in numbers if not changes[i].station and not changes[i].columns and not changes[i].members]
-    if len(case.times) <= _FIRST_EPOCHS or len(readings) <= _KEPT:
-        return numbers
-    first = np.argsort(-case.dof, kind="stable")[:_FIRST_EPOCHS]
-    few = MisfitCase(
-        case.base.take(first), case.times[first], case.number[first], case.x[first], case.dof[first], case.origin
-    )
-    some = [changes[i].in_epochs(first) for i in readings]
-    of_first = {id(one.change): one.score for one in scored(few, some, fit(few, some), [0.0] * len(some))}
-    score = {i: of_first.get(id(change), np.inf) for i, change in zip(readings, some, strict=True)}
-    kept = sorted(readings, key=lambda i: score[i])[:_KEPT]
-    return [i for i in numbers if i not in set(readings) - set(kept)]
 
 
 def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:

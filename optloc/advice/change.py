@@ -7,7 +7,7 @@ stations, d coordinates, and q parameters of a change.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -86,6 +86,8 @@ class Change:
         Kind of the rows of an error of one station; empty for all kinds.
     base : Problem, optional
         Problems (K,) of another structure, to which the change applies instead.
+    least : float
+        Cost of the rows that the change does not affect, which no fit of the change can lower.
     admits : callable, optional
         Returns whether estimates (q,) are values that the cause can have. By default, all are.
     """
@@ -108,12 +110,15 @@ class Change:
     levels: bool = False
     kind: str = ""
     base: Problem | None = None
+    least: float = 0.0
     admits: Callable[[Array], bool] | None = None
 
     def in_epochs(self, items: Array) -> Change:
-        """Return a change without parameters in some of the epochs."""
+        """Return a change in some of the epochs."""
         arrays = {name: getattr(self, name) for name in ("factor", "shift", "spread", "weight")}
-        return replace(self, **{name: each[items] for name, each in arrays.items() if np.ndim(each) == 2})
+        columns = tuple(replace(column, coefficient=column.coefficient[items]) for column in self.columns)
+        part = {name: each[items] for name, each in arrays.items() if np.ndim(each) == 2}
+        return replace(self, columns=columns, **part)
 
     def size(self, dimension: int) -> int:
         """Return the number q of parameters."""
@@ -138,6 +143,8 @@ class MisfitCase:
         Degrees of freedom.
     origin : float
         Time of zero drift, s.
+    cost : array (K,), optional
+        Costs of the epochs without a change, if they are known.
     """
 
     base: Problem
@@ -146,7 +153,12 @@ class MisfitCase:
     x: Array
     dof: Array
     origin: float = 0.0
-    epochs: int = field(default=1)
+    cost: Array | None = None
+
+    def in_epochs(self, items: Array) -> MisfitCase:
+        """Return the case of some of the epochs."""
+        arrays = {name: getattr(self, name)[items] for name in ("times", "number", "x", "dof")}
+        return replace(self, base=self.base.take(items), cost=None if self.cost is None else self.cost[items], **arrays)
 
     @cached_property
     def present(self) -> Array:

@@ -77,7 +77,10 @@ def changed(case: MisfitCase, changes: Sequence[Change], theta: Array) -> Proble
             target[e] += theta[e, j] * column.coefficient
 
     def stacked(name: str) -> Array:
-        return np.stack([np.broadcast_to(getattr(change, name), shape[1:]) for change in changes])
+        out = np.empty(shape)
+        for e, change in enumerate(changes):
+            out[e] = getattr(change, name)
+        return out
 
     factor, correction = stacked("factor"), np.broadcast_to(base.correction, shape[1:])
     observed = np.where(case.present, np.broadcast_to(base.z, shape[1:]), 0.0) - correction
@@ -180,6 +183,7 @@ def _first_values(case: MisfitCase, changes: Sequence[Change], theta: Array, x: 
 class _System:
     """Whitened residuals (E, K, m), columns of the parameters (E, K, m, q), and their coupling (E, K, size, q)."""
 
+    lanes: Problem
     residual: Array
     columns: Array
     information: Array
@@ -201,7 +205,7 @@ def _system(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array)
     columns = white[..., 1 + n :]
     coupling = np.swapaxes(white[..., 1 : 1 + n], -1, -2) @ columns
     parts = (white[..., 0], columns, information, vector, coupling)
-    return _System(*(part.reshape(*shape[:2], *part.shape[1:]) for part in parts))
+    return _System(lanes, *(part.reshape(*shape[:2], *part.shape[1:]) for part in parts))
 
 
 def _dense(problem: Problem, shared: Array, local: Array) -> Array:
@@ -266,9 +270,9 @@ def _solve(information: Array, vector: Array) -> Array:
     return np.asarray((root @ (np.swapaxes(root, -1, -2) @ vector[..., None]))[..., 0])
 
 
-def _reduced(case: MisfitCase, system: _System, lanes: Problem, x: Array) -> tuple[Array, Array, Array]:
+def _reduced(system: _System, x: Array) -> tuple[Array, Array, Array]:
     """Return information (E, q, q) and right side (E, q) of the parameters, and whether x is determined (E, K)."""
-    shape = x.shape
+    shape, lanes = x.shape, system.lanes
     space = np.broadcast_to(np.eye(shape[-1]), (shape[0] * shape[1], shape[-1], shape[-1]))
     equalities = Equalities.of(lanes)
     if equalities.lasting:
@@ -314,9 +318,15 @@ def _descend(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array
         if not len(active):
             break
         some = [changes[int(i)] for i in active]
-        system = _system(case, some, theta[active], x[active])
-        information, pull, _ = _reduced(case, system, changed(case, some, theta[active]), x[active])
-        step = _bounded(some, theta[active], _solve(information, pull) * length[active, None])
+        information, pull, _ = _reduced(_system(case, some, theta[active], x[active]), x[active])
+        step = _solve(information, pull)
+        # the fall that a step promises: without it, the steps have ended
+        promising = (pull * step).sum(-1) > _DONE
+        active, step = active[promising], step[promising]
+        some = [changes[int(i)] for i in active]
+        if not some:
+            break
+        step = _bounded(some, theta[active], step * length[active, None])
         new, new_cost = settle(theta[active] + step, x[active], active)
         fall = cost[active].sum(-1) - new_cost.sum(-1)
         better = fall > 0.0
@@ -341,15 +351,14 @@ def _bounded(changes: Sequence[Change], theta: Array, step: Array) -> Array:
 
 def _assessed(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array, cost: Array) -> Fits:
     """Return the fits, with infinite costs where the data determine no position, and sigmas of the parameters."""
-    lanes = changed(case, changes, theta)
     system = _system(case, changes, theta, x)
-    information, _, determined = _reduced(case, system, lanes, x)
+    information, _, determined = _reduced(system, x)
     sizes = np.array([change.size(case.base.dimension) for change in changes])
     used = np.arange(theta.shape[1]) < sizes[:, None]
     root, _ = linalg.root(information)
     variance = (root**2).sum(-1)
     sigma = np.sqrt(np.where(used & (np.diagonal(information, axis1=-2, axis2=-1) > 0.0), variance, np.inf))
-    cost = np.where(determined & ~_is_far(lanes, x), cost, np.inf)
+    cost = np.where(determined & ~_is_far(system.lanes, x), cost, np.inf)
     # a parameter without information changes nothing, so that the change is no explanation
     open_parameter = np.asarray((used & ~np.isfinite(sigma)).any(-1))
     cost = np.where(open_parameter[:, None], np.inf, cost)

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording, Words
 from optloc.advice.suspects import Suspects
-from optloc.advice.wording import bias_lines, size_text
+from optloc.advice.wording import bias_lines, size_text, station_lines
 from optloc.base.types import Array, CompassRows
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.models import MODELS
@@ -287,16 +287,27 @@ def coordinate_units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     if case.base.frame.geodetic or not case.present[:, case.rows_where("length")].any():
         return
     sizes = [UNITS["length"][unit] for unit in _COORDINATE_UNITS]
-    factors = dict(zip(_COORDINATE_UNITS, sizes, strict=True))
-    for unit, size in factors.items():
-        for factor, stated, meant in ((size, "m", unit), (1.0 / size, unit, "m")):
-            words = partial(_coordinate_words, stated, meant, factor)
-            yield Change("coordinate-unit", words, position=place * factor, alternatives=2 * len(factors))
+    for factor in (*sizes, *(1.0 / size for size in sizes)):
+        words = partial(_coordinate_words, case, factor)
+        yield Change("coordinate-unit", words, position=place * factor, alternatives=2 * len(sizes))
 
 
-def _coordinate_words(stated: str, meant: str, factor: float, theta: Array, sigma: Array) -> Wording:
+def _coordinate_words(case: MisfitCase, factor: float, theta: Array, sigma: Array) -> Wording:
+    table, written = UNITS["length"], case.base.written
+    size = (
+        written.place_unit if written is not None and written.place_unit else 1.0 if factor in table.values() else 0.0
+    )
+    size = size or 1.0 / factor
+    stated, meant = (
+        next((name for name, own in table.items() if abs(own / wanted - 1.0) < _SAME_UNIT), "")
+        for wanted in (size, size * factor)
+    )
+    if not meant:
+        seen = f"the values fit with coordinates of stations that are {factor:.4g} times as large"
+        return Wording(seen, "check their unit")
     seen = f"the values fit with coordinates of stations in {meant} instead of {stated}, {factor:.4g} times as large"
-    return Wording(seen, f'state their unit: unit = "{meant}" in the table of the stations')
+    lines = f'[stations]\nunit = "{meant}"\n' if written is not None and written.place_unit else ""
+    return Wording(seen, f'state their unit: unit = "{meant}" in the table of the stations', lines)
 
 
 def swapped_coordinates(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
@@ -308,8 +319,10 @@ def swapped_coordinates(case: MisfitCase, suspects: Suspects) -> Iterator[Change
     if np.abs(lon).max() > np.pi / 2:
         return
     position = frame.from_geodetic(lon, lat, height)
-    yield Change("lat-lon", _lat_lon_words, position=position)
+    yield Change("lat-lon", partial(_lat_lon_words, case, position), position=position)
 
 
-def _lat_lon_words(theta: Array, sigma: Array) -> Wording:
-    return Wording("the values fit if latitude and longitude of the stations are exchanged", "exchange the two columns")
+def _lat_lon_words(case: MisfitCase, position: Array, theta: Array, sigma: Array) -> Wording:
+    lines = station_lines(case, dict(enumerate(position.reshape(-1, case.base.dimension))))
+    seen = "the values fit if latitude and longitude of the stations are exchanged"
+    return Wording(seen, "exchange the two columns", lines)

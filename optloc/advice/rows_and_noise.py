@@ -39,7 +39,7 @@ def pairs_of_outliers(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
 
 def _without_rows(case: MisfitCase, sets: Sequence[tuple[tuple[int, int], ...]]) -> Iterator[Change]:
     """Yield unknown errors of sets of rows; a row has the number of its epoch and its number there."""
-    many = int(case.present.sum())
+    many, cost = int(case.present.sum()), np.zeros(len(case.times)) if case.cost is None else case.cost
     for pair in sets:
         columns = []
         for epoch, row in pair:
@@ -53,6 +53,7 @@ def _without_rows(case: MisfitCase, sets: Sequence[tuple[tuple[int, int], ...]])
             tuple(int(case.number[epoch, row]) for epoch, row in pair),
             columns=tuple(columns),
             alternatives=many if len(pair) == 1 else many * (many - 1) / 2,
+            least=float(np.delete(cost, [epoch for epoch, _ in pair]).sum()),
         )
 
 
@@ -141,35 +142,46 @@ def late_fit(case: MisfitCase) -> LateFit | None:
         return None
     if any(block.row.shape[1] > 1 for block in case.base.noise.blocks):
         return None
-    fits = [_alternate(case, share, delay) for share, delay in _STARTS]
+    fits = _alternate(case)
     return min(fits, key=lambda one: one.score)
 
 
-def _alternate(case: MisfitCase, share: float, delay: float) -> LateFit:
-    """Return the mixture after the alternation, from a share and a mean delay."""
-    sigma = np.sqrt(variances(case.base.noise, case.base.count)) * np.ones(case.present.shape)
-    sigma = sigma / np.sqrt(np.where(case.present, case.base.weight, 1.0))
-    x, z = case.x, np.where(case.present, np.broadcast_to(case.base.z, sigma.shape), 0.0)
+def _alternate(case: MisfitCase) -> list[LateFit]:
+    """Return the mixtures after the alternation, one for each start, all starts side by side."""
+    count, shape = len(_STARTS), case.present.shape
+    lanes = case.base.take(np.tile(np.arange(shape[0]), count))
+    use = np.tile(case.present, (count, 1))
+    sigma = np.sqrt(variances(lanes.noise, lanes.count)) * np.ones(use.shape)
+    sigma = sigma / np.sqrt(np.where(use, lanes.weight, 1.0))
+    x, z = np.tile(case.x, (count, 1)), np.where(use, lanes.z, 0.0)
+    share, delay = (np.array(values) for values in zip(*_STARTS, strict=True))
+
+    def mixed(x: Array) -> tuple[Array, Array, Array]:
+        """Return residuals in sigmas, and densities of punctual and of late rows, weighted by their shares."""
+        residual = np.where(use, linearise(lanes, x).residual / sigma, 0.0)
+        each = np.repeat(share, shape[0])[:, None]
+        punctual, late = _densities(residual, np.repeat(delay, shape[0])[:, None])
+        return residual, (1.0 - each) * punctual, each * late
+
     for _ in range(_ROUNDS):
-        residual = np.where(case.present, linearise(case.base, x).residual / sigma, 0.0)
-        punctual, late = _densities(residual, delay)
-        chance = share * late / np.maximum((1.0 - share) * punctual + share * late, 1e-300)
+        residual, punctual, late = mixed(x)
+        chance = late / np.maximum(punctual + late, 1e-300)
         # of a late row, the delay has the mean of its truncated exponential, and noise of this size
-        expected = np.clip(residual, 0.0, None)
-        precision = (1.0 - chance) + chance / (1.0 + delay**2)
-        shift = chance / (1.0 + delay**2) * delay / precision
-        lanes = case.base.with_rows(z=z - shift * sigma, weight=case.base.weight * precision)
-        x, _ = descend(lanes, x)
-        use = case.present
-        share = float(np.clip(chance[use].mean(), 0.02, 0.6))
-        delay = float(np.clip((chance * expected)[use].sum() / max(chance[use].sum(), 1e-9), 3.0, 1e4))
-    residual = linearise(case.base, x).residual / sigma
-    punctual, late = _densities(residual, delay)
-    density = np.maximum((1.0 - share) * punctual + share * late, 1e-300)
-    return LateFit(float(-2.0 * np.log(density)[case.present].sum()), share, delay, x)
+        expected, mean = np.clip(residual, 0.0, None), np.repeat(delay, shape[0])[:, None]
+        precision = (1.0 - chance) + chance / (1.0 + mean**2)
+        shift = chance / (1.0 + mean**2) * mean / precision
+        x, _ = descend(lanes.with_rows(z=z - shift * sigma, weight=lanes.weight * precision), x)
+        total, counted = (np.where(use, value, 0.0).reshape(count, -1).sum(1) for value in (chance, chance * expected))
+        share = np.clip(total / case.present.sum(), 0.02, 0.6)
+        delay = np.clip(counted / np.maximum(total, 1e-9), 3.0, 1e4)
+    _, punctual, late = mixed(x)
+    density = np.log(np.maximum(punctual + late, 1e-300))
+    score = -2.0 * np.where(use, density, 0.0).reshape(count, -1).sum(1)
+    places = x.reshape(count, *case.x.shape)
+    return [LateFit(float(score[i]), float(share[i]), float(delay[i]), places[i]) for i in range(count)]
 
 
-def _densities(residual: Array, delay: float) -> tuple[Array, Array]:
+def _densities(residual: Array, delay: Array) -> tuple[Array, Array]:
     """Return the densities of punctual and of late rows, in units of the peak of a normal density."""
     late = np.exp(log_ndtr(residual - 1.0 / delay) + 0.5 / delay**2 - residual / delay) * np.sqrt(2.0 * np.pi) / delay
     return np.exp(-0.5 * residual**2), late

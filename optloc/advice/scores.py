@@ -8,6 +8,7 @@ prices. Smaller scores are better, and a difference of 9 is three sigma of one n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,28 +82,39 @@ def score_of_level(cost: float, dof: int) -> float:
     return dof * (1.0 + float(np.log(cost / dof))) + price_of_level(float(np.sqrt(cost / dof)), dof)
 
 
-def scored(case: MisfitCase, changes: list[Change], fits: Fits, odds: list[float]) -> list[Scored]:
+def least_score(case: MisfitCase, change: Change, odds: float, cost: float = 0.0) -> float:
+    """Return a score that a change has at least; `cost` is a cost that it has at least, as far as it is known."""
+    parameters = price_of_parameters(np.zeros(change.size(case.base.dimension)), np.ones(1))
+    return max(cost, change.least) + _price_of_change(case, change, odds) + parameters
+
+
+def _price_of_change(case: MisfitCase, change: Change, odds: float) -> float:
+    """Return the part of a score that is known before a fit: of the cause, the choice and the noise."""
+    spread = np.broadcast_to(change.spread, case.present.shape)
+    enlarged = 2.0 * float(np.log(spread)[case.present].sum())
+    if change.levels:
+        # part of the rows is used up by the unknowns
+        inside = int((np.broadcast_to(change.spread != 1.0, case.present.shape) & case.present).sum())
+        share = max(float(case.dof.sum()), 1.0) / max(int(case.present.sum()), 1)
+        enlarged = enlarged * share + price_of_level(float(spread.max()), inside * share)
+    more = change.extra * price_of_parameters(np.array([30.0]), np.ones(1))
+    return odds + 2.0 * float(np.log(change.alternatives)) + more + enlarged
+
+
+def scored(case: MisfitCase, changes: Sequence[Change], fits: Fits, odds: Sequence[float]) -> list[Scored]:
     """Return the scores of fitted changes, without those that fit no determined position or have impossible estimates.
 
     `odds` (E,) are the prices of the causes.
     """
-    out, all_rows = [], int(case.present.sum())
+    out = []
     for e, change in enumerate(changes):
         cost, q = float(fits.cost[e].sum()), change.size(case.base.dimension)
         dof = int(case.dof.sum()) - q - change.extra
         if not np.isfinite(cost) or dof < 0:
             continue
-        spread = np.broadcast_to(change.spread, case.present.shape)
-        enlarged = 2.0 * float(np.log(spread)[case.present].sum())
-        if change.levels:
-            # part of the rows is used up by the unknowns
-            inside = int((np.broadcast_to(change.spread != 1.0, case.present.shape) & case.present).sum())
-            share = max(float(case.dof.sum()), 1.0) / max(all_rows, 1)
-            enlarged = enlarged * share + price_of_level(float(spread.max()), inside * share)
         theta, sigma = fits.theta[e, :q], fits.sigma[e, :q]
         if change.admits is not None and not change.admits(theta):
             continue
-        price = odds[e] + 2.0 * float(np.log(change.alternatives))
-        price += price_of_parameters(theta, sigma) + change.extra * price_of_parameters(np.array([30.0]), np.ones(1))
-        out.append(Scored(change, theta, sigma, cost, dof, cost + enlarged + price, fits.x[e]))
+        score = cost + _price_of_change(case, change, odds[e]) + price_of_parameters(theta, sigma)
+        out.append(Scored(change, theta, sigma, cost, dof, score, fits.x[e]))
     return out

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.advice.change import Change, ErrorColumn, MisfitCase, Wording
 from optloc.advice.suspects import Suspects
-from optloc.advice.wording import bias_lines, quoted, size_text, station_words, unit_of
+from optloc.advice.wording import bias_lines, quoted, size_text, station_lines, station_words, unit_of
 from optloc.base.types import Array, CompassRows
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.models import MODELS
@@ -68,7 +68,7 @@ def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     if len(times) < _STEP_TIMES:
         return
     cuts = times[np.unique(np.linspace(1, len(times) - 1, min(len(times) - 1, _CUTS)).round().astype(int))]
-    for station, kind in suspects.first(_STEPPED):
+    for station, kind, x, least in suspects.possible(_STEPPED):
         own = case.coefficients("station", "offset", kind, case.names[station])
         for cut in cuts.tolist():
             column = own * (case.when >= cut)
@@ -79,9 +79,10 @@ def steps(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
                 (case.names[station],),
                 columns=(ErrorColumn("adds", column),),
                 starts=((0.0,),),
-                x=suspects.start(station, kind),
+                x=x,
                 alternatives=suspects.count * len(cuts),
                 kind=kind,
+                least=least,
             )
 
 
@@ -117,10 +118,12 @@ def _rotation_words(case: MisfitCase, name: str, theta: Array, sigma: Array) -> 
 
 
 def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> Iterator[Change]:
-    for station, kind in suspects.first(_TRIED):
+    for station, kind, x, least in suspects.possible(_TRIED):
         if FORMS[form].enters == "scales" and MODELS[kind].period is not None:
             continue
         own = case.coefficients("station", form, kind, case.names[station])  # type: ignore[arg-type]
+        if FORMS[form].enters == "scales" and (own != 0.0).all():
+            continue  # a scale of all rows is another speed of the wave
         column = own * (case.when if FORMS[form].rate else np.ones_like(case.when))
         words = partial(station_words, case, form, kind, case.names[station])
         yield Change(
@@ -128,14 +131,15 @@ def _of_form(case: MisfitCase, suspects: Suspects, form: str, enters: str) -> It
             words,
             (case.names[station],),
             columns=(ErrorColumn(enters, column),),  # type: ignore[arg-type]
-            x=suspects.start(station, kind),
+            x=x,
             alternatives=suspects.count,
+            least=least,
         )
 
 
 def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield the opposite sign of the values of single stations."""
-    for station, kind in suspects.first(_TRIED):
+    for station, kind, x, least in suspects.possible(_TRIED):
         rows = case.rows_at(station) & case.rows_of(kind)
         if MODELS[kind].ranges != (1, -1) and not MODELS[kind].emission and MODELS[kind].period is None:
             continue
@@ -148,8 +152,9 @@ def signs(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
             (case.names[station],),
             factor=np.where(rows, -1.0, 1.0),
             shift=_turned_back(case, rows),
-            x=suspects.start(station, kind),
+            x=x,
             alternatives=suspects.count,
+            least=least,
         )
 
 
@@ -186,7 +191,9 @@ def periods(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
                 words = partial(_period_words, case, change.station[0], kind, count, name, count * length)
                 choices = suspects.count * len(table) * (2 * _MULTIPLES if MODELS[kind].quantity == "length" else 1)
                 shift = -count * length * column
-                yield Change("period", words, change.station, shift=shift, x=change.x, alternatives=choices)
+                yield replace(
+                    change, cause="period", words=words, shift=shift, columns=(), starts=(), alternatives=choices
+                )
 
 
 def _period_words(
@@ -212,12 +219,17 @@ def exchanges(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
         order = np.arange(case.base.stations.count)
         order[[i, j]] = j, i
         names = (case.names[i], case.names[j])
-        yield Change("swapped", partial(_exchange_words, names), names, position=place[:, order], alternatives=choices)
+        yield Change(
+            "swapped", partial(_exchange_words, case, (i, j)), names, position=place[:, order], alternatives=choices
+        )
 
 
-def _exchange_words(names: tuple[str, str], theta: Array, sigma: Array) -> Wording:
+def _exchange_words(case: MisfitCase, pair: tuple[int, int], theta: Array, sigma: Array) -> Wording:
+    place, names = case.base.stations.places, [case.names[i] for i in pair]
+    lines = station_lines(case, {one: place[other] for one, other in zip(pair, pair[::-1], strict=True)})
     seen = f"the values fit if the stations {names[0]} and {names[1]} are exchanged"
-    return Wording(seen, f"exchange the positions of {names[0]} and {names[1]}, or their names in the measurements")
+    advice = f"exchange the positions of {names[0]} and {names[1]}, or their names in the measurements"
+    return Wording(seen, advice, lines)
 
 
 def references(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
@@ -262,6 +274,7 @@ def moves(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
             starts=start,
             x=suspects.start(station, kind),
             alternatives=len(case.stations),
+            least=suspects.least_of(station),
         )
 
 
@@ -270,4 +283,5 @@ def _move_words(case: MisfitCase, station: int, theta: Array, sigma: Array) -> W
     text = ", ".join(f"{v:.6g}" for v in place)
     away = f"{np.linalg.norm(theta):.4g} m away from its stated position"
     seen = f"the values fit if station {case.names[station]} is {away}"
-    return Wording(seen, f"check its coordinates; the values give ({text}) m, in the axes of the problem")
+    advice = f"check its coordinates; the values give ({text}) m, in the axes of the problem"
+    return Wording(seen, advice, station_lines(case, {station: place}, float(sigma.min())))

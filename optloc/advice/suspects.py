@@ -23,9 +23,12 @@ class Suspects:
     ----------
     case : MisfitCase
         The problem.
+    limit : float
+        Cost from which an explanation is of no interest.
     """
 
     case: MisfitCase
+    limit: float = np.inf
 
     @cached_property
     def _stated(self) -> tuple[Change, ...]:
@@ -77,14 +80,30 @@ class Suspects:
         return fit(self.case, changes)
 
     @cached_property
-    def offsets(self) -> tuple[Change, ...]:
-        """Return the offsets of all channels, each with a start."""
-        return tuple(replace(one, x=x) for one, x in zip(self._stated, self.without.x, strict=True))
+    def least(self) -> Array:
+        """Return the cost without the rows of each channel: an error of the channel alone has no smaller cost.
+
+        It is zero for channels that the position needs. Epochs that the other rows do not determine count as zero.
+        """
+        stated = np.array([bool(change.starts) for change in self._stated], dtype=bool)
+        cost = np.where(np.isfinite(self.without.cost), self.without.cost, 0.0)
+        return np.where(stated, 0.0, cost.sum(-1))
 
     @cached_property
-    def fits(self) -> Fits:
-        """Return the fits of all offsets."""
-        return fit(self.case, self.offsets)
+    def _possible(self) -> tuple[int, ...]:
+        """Return the numbers of the channels whose error may be of interest, least cost without their rows first."""
+        return tuple(i for i in self.order if self.least[i] < self.limit)
+
+    @cached_property
+    def offsets(self) -> tuple[Change, ...]:
+        """Return the offsets of the channels that may be wrong, each with a start."""
+        some, x = self._possible, self.without.x
+        return tuple(replace(self._stated[i], x=x[i], least=float(self.least[i])) for i in some)
+
+    @cached_property
+    def fits(self) -> Fits | None:
+        """Return the fits of these offsets; None without offsets."""
+        return fit(self.case, self.offsets) if self.offsets else None
 
     @cached_property
     def order(self) -> tuple[int, ...]:
@@ -97,12 +116,24 @@ class Suspects:
         """Return the unknowns (K, size) without the rows of a channel."""
         return np.asarray(self.without.x[self.channels.index((station, kind))])
 
+    def least_of(self, station: int) -> float:
+        """Return the cost that an error of all rows of a station has at least."""
+        own = [i for i, (each, _) in enumerate(self.channels) if each == station]
+        return float(self.least[own[0]]) if len(own) == 1 else 0.0
+
     def first(self, count: int) -> list[tuple[int, str]]:
         """Return the first channels in this order."""
         return [self.channels[i] for i in self.order[:count]]
 
+    def possible(self, count: int) -> Iterator[tuple[int, str, Array, float]]:
+        """Yield the first channels that may be wrong: station, kind, unknowns without their rows, and least cost."""
+        for i in self._possible[:count]:
+            yield *self.channels[i], self.without.x[i], float(self.least[i])
+
     def estimates(self, count: int) -> Iterator[tuple[Change, float, float]]:
-        """Yield the offsets of the first channels, with estimate and standard deviation."""
-        for i in self.order[:count]:
+        """Yield the offsets of the first channels that may be wrong, with estimate and standard deviation."""
+        if self.fits is None:
+            return
+        for i, change in enumerate(self.offsets[:count]):
             if np.isfinite(self.fits.cost[i].sum()):
-                yield self.offsets[i], float(self.fits.theta[i, 0]), float(self.fits.sigma[i, 0])
+                yield change, float(self.fits.theta[i, 0]), float(self.fits.sigma[i, 0])

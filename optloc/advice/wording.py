@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -41,6 +41,38 @@ def bias_lines(
     lines += [f"members = [{', '.join(map(quoted, members))}]"] if members else []
     lines += [f'mean = "{mean}"', f'sigma = "{sigma}"'] if mean else []
     return "\n".join(["[[biases]]", *lines]) + "\n"
+
+
+def station_lines(case: MisfitCase, places: Mapping[int, Array], sigma: float = 0.0) -> str:
+    """Return the rows of stations at other places (d,), in the frame, as the file writes rows; empty if it is unknown.
+
+    `sigma` is the standard deviation of the coordinates, m: digits far below it are left out.
+    """
+    written = case.base.written
+    if written is None or not written.place_keys or not written.place_unit:
+        return ""
+    rows = []
+    for station, place in places.items():
+        values = np.asarray(place) / written.place_unit
+        digits = np.full(len(values), _digits(sigma / written.place_unit))
+        if "lat_deg" in written.place_keys:
+            lat, lon, height = (float(np.ravel(part)[0]) for part in case.base.frame.to_geodetic(place))
+            values = np.array([np.degrees(lat), np.degrees(lon), height / written.place_unit])
+            digits[:2] = _digits(sigma / _DEGREE)
+        parts = [
+            f"{key} = {round(float(v), int(n))!r}" for key, v, n in zip(written.place_keys, values, digits, strict=True)
+        ]
+        rows.append(f"  {{ name = {quoted(case.names[station])}, {', '.join(parts)} }},\n")
+    return f"[stations]\nrows = [\n{''.join(rows)}]\n"
+
+
+# Length of one degree of latitude, m, and the number of digits of exact coordinates.
+_DEGREE, _EXACT = 111e3, 12
+
+
+def _digits(sigma: float) -> int:
+    """Return the number of decimals of a number with a standard deviation: a thousandth of it."""
+    return _EXACT if sigma <= 0.0 else int(np.clip(3.0 - np.floor(np.log10(sigma)), 0, _EXACT))
 
 
 def row_name(case: MisfitCase, epoch: int, row: int) -> str:

@@ -19,6 +19,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, check_budget
 from optloc.base.types import Array, Bias, Rows, Stations
+from optloc.base.units import UNITS
 from optloc.files.constraint_reader import (
     Demand,
     constraints_of,
@@ -43,7 +44,7 @@ from optloc.files.phase_rows import check_layers, combined_noise, split_phases, 
 from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
-from optloc.files.schema import ProblemFile, name_of, read_document
+from optloc.files.schema import ProblemFile, StationsTable, name_of, read_document
 from optloc.files.settings import Units, join
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
@@ -163,9 +164,19 @@ class Draft:
         speed = self.chunks[0].units.speed if self.chunks else None
         own = any(isinstance(one, str) for each in self.file.measurements for one in (each.sigma, each.arrival_sigma))
         both = any(each.two_way or each.turn_around is not None for each in self.file.measurements)
-        problem = replace(self.loaded.problem, written=Written(units, speed, both, own))
+        size, keys = UNITS["length"].get(self.file.stations.unit), _place_keys(self.file.stations)
+        problem = replace(self.loaded.problem, written=Written(units, speed, both, own, size, keys))
         more = unused_picks(self.chunks, problem.stations.names)
         return replace(self.loaded, problem=problem, warnings=found + more)
+
+
+_PLACE_KEYS = (("x", "y"), ("x", "y", "z"), ("lat_deg", "lon_deg", "height"))
+
+
+def _place_keys(stations: StationsTable) -> tuple[str, ...]:
+    """Return the keys of the coordinates in the rows of stations that have no other keys than these and the name."""
+    keys = {tuple(sorted(row)) for row in stations.rows or ()}
+    return next((each for each in _PLACE_KEYS if keys == {tuple(sorted(("name", *each)))}), ())
 
 
 def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:

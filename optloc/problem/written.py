@@ -20,9 +20,16 @@ class Written:
         Whether the times are of both ways, so that the stated speed of the wave is twice `speed`.
     noise_has_unit : bool
         Whether the noise is text with a separate unit, so that it stays if the unit of the values changes.
+    place_unit : float, optional
+        Size of one unit of the coordinates of the stations, m.
+    place_keys : tuple of str
+        Keys of the coordinates in the rows of the stations, such as ``("x", "y")``; empty if the rows are in another
+        file or have more keys than the name and these.
     """
 
     units: Mapping[str, float] = field(default_factory=dict)
     speed: float | None = None
     there_and_back: bool = False
     noise_has_unit: bool = False
+    place_unit: float | None = None
+    place_keys: tuple[str, ...] = ()

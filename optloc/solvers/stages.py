@@ -43,7 +43,7 @@ from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.orientation import headings, oriented_starts, unwind
 from optloc.solvers.starts.position import along_the_valley, is_registration_run, spread_of, subarray_starts
 from optloc.solvers.starts.registration import step_beside
-from optloc.solvers.starts.several_positions import from_pieces
+from optloc.solvers.starts.several_positions import from_pieces, is_epochwise
 from optloc.solvers.verdict.judge import judge, surviving_candidates
 from optloc.solvers.verdict.minima import is_measured, settle
 
@@ -307,6 +307,12 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     if one_position(problem):
         positions = partial(_searched, tried=f"{_PLACES} positions")
         pool = _search_unanswered(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), positions)
+    elif is_epochwise(problem):
+        # no closed form starts the epochs, but a search fixes each of them
+        epochs = partial(_searched, tried=f"{_PLACES} positions of each epoch")
+        pool = _search_unanswered(
+            problem, pool, lambda part: from_pieces(part, lambda piece: fix_by(piece, search_widely)), epochs
+        )
     return pool
 
 

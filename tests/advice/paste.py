@@ -15,8 +15,8 @@ def pasted(text: str, lines: str) -> str:
     """Return the text of a problem file with the lines of a suggestion.
 
     Keys before the first header of the lines belong to the tables of measurements, or to the top of the file. Keys
-    below a header that the file has, such as ``[stations]``, go there. Keys replace keys of the same name. Other tables
-    are appended at the end.
+    below a header that the file has, such as ``[stations]``, go there. Keys replace keys of the same name, and rows of
+    stations replace the rows with the same names. Other tables are appended at the end.
     """
     blocks = re.split(r"^(?=\[)", text, flags=re.MULTILINE)
     added = []
@@ -25,6 +25,10 @@ def pasted(text: str, lines: str) -> str:
         if header.startswith("[["):
             added.append(part)
             continue
+        for row, name in re.findall(r'^  (\{ name = ("[^"]*"), .*\},)$', rest, re.MULTILINE):
+            pattern = re.compile(rf"^  \{{ name = {re.escape(name)},.*$", re.MULTILINE)
+            blocks = [pattern.sub(f"  {row}", one) if one.startswith(header) else one for one in blocks]
+        rest = re.sub(r"^rows = \[\n(  .*\n)*\]\n", "", rest, flags=re.MULTILINE)
         for line in filter(None, map(str.strip, rest.splitlines())):
             key = line.partition("=")[0].strip()
             wanted = header or ("" if key in TOP else "[[measurements]]")
@@ -33,6 +37,15 @@ def pasted(text: str, lines: str) -> str:
                 if (block.startswith(wanted) if wanted else i == 0) and any(kind in block for kind in kinds):
                     blocks[i] = _with_key(block, key, line)
     return "".join(blocks) + "".join(f"\n{one}" for one in added)
+
+
+def without_rows(text: str, members: tuple[int, ...]) -> str:
+    """Return the text of a problem file without some rows of the measurements, numbers in the order of the file."""
+    head, mark, rest = text.partition("[[measurements]]")
+    lines = (mark + rest).splitlines(keepends=True)
+    rows = [i for i, line in enumerate(lines) if line.startswith("  { ")]
+    dropped = {rows[i] for i in members}
+    return head + "".join(line for i, line in enumerate(lines) if i not in dropped)
 
 
 def _with_key(block: str, key: str, line: str) -> str:

@@ -1,8 +1,13 @@
 """Names and numbers in advice."""
 
+from dataclasses import replace
+
+import numpy as np
+import pytest
 from advice.cases import range_case
 
-from optloc.advice.wording import bias_lines, quoted, row_name, size_text
+from optloc.advice.wording import bias_lines, quoted, row_name, size_text, station_lines
+from optloc.problem.written import Written
 
 
 def test_names_are_quoted_for_toml():
@@ -23,3 +28,23 @@ def test_a_bias_has_the_lines_of_a_file():
     lines = bias_lines(range_case()[0], "offset", "station", "range", ("S1",))
     assert lines.splitlines()[0] == "[[biases]]"
     assert 'members = ["S1"]' in lines
+
+
+@pytest.mark.parametrize(
+    ("unit", "keys", "sigma", "row"),
+    [
+        (1.0, ("x", "y"), 0.0, "x = 10.0, y = -20.5 "),
+        (1000.0, ("x", "y"), 0.0, "x = 0.01, y = -0.0205 "),
+        (1.0, ("x", "y"), 3000.0, "x = 10.0, y = -20.0 "),
+    ],
+)
+def test_rows_of_stations_are_in_the_unit_of_the_file(unit, keys, sigma, row):
+    case, _ = range_case()
+    base = replace(case.base, written=Written(place_unit=unit, place_keys=keys))
+    lines = station_lines(replace(case, base=base), {2: np.array([10.0, -20.5])}, sigma)
+    assert lines == f'[stations]\nrows = [\n  {{ name = "S2", {row}}},\n]\n'
+
+
+def test_rows_of_stations_of_another_file_are_unknown():
+    case, _ = range_case()
+    assert station_lines(case, {2: np.zeros(2)}) == ""

@@ -52,6 +52,13 @@ def test_kilometres_and_sound(tmp_path):
     np.testing.assert_allclose(problem.z, [z * 0.343 for _, _, z in TDOA])
     np.testing.assert_allclose(problem.stations.position[0], 1e3 * np.array(list(STATIONS.values())))
     np.testing.assert_allclose(dense(problem.noise, np.arange(3)), np.eye(3) * (2 * 0.343) ** 2)
+    assert (problem.written.place_unit, problem.written.place_keys) == (1e3, ("x", "y", "z"))
+
+
+@pytest.mark.parametrize("more", [", sigma = 1.0", ", vx = 0.0, vy = 0.0, vz = 0.0"])
+def test_rows_of_stations_with_more_than_coordinates_have_no_known_keys(more, tmp_path):
+    text = tdoa(extra="arrival_sigma = 3.0\n").replace(" }", f"{more} }}", len(STATIONS))
+    assert load(write(tmp_path, text)).written.place_keys == ()
 
 
 def long_table():

@@ -24,9 +24,11 @@ from optloc.solvers.starts.angles import course_starts, course_states
 
 
 def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
-    """Return one starting vector (N, 1, size) for a flat batch of problems with several targets or epochs.
+    """Return starting vectors (N, C, size) for a flat batch of problems with several targets or epochs.
 
-    A state that its rows do not determine starts from its prior, if it has one.
+    A state that its rows do not determine starts from its prior, if it has one. The first vector uses all rows as if no
+    bias affected them. If biases affect a part of the rows, a second vector uses the others. A large error of one
+    station moves the positions of the first vector, so that its descent can miss the best minimum.
 
     Parameters
     ----------
@@ -35,6 +37,27 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     fixed : callable
         Maps a flat batch of problems of one position to its fix.
     """
+    x, others = _from_rows(problem, fixed), _without_biased_rows(problem)
+    return x if others is None else np.concatenate([x, _from_rows(others, fixed)], axis=1)
+
+
+def is_epochwise(problem: Problem) -> bool:
+    """Return whether a problem has one target with a free position in each of several epochs."""
+    return len(problem.motions) == 1 and problem.motions[0].span == "epoch" and problem.epochs > 1
+
+
+def _without_biased_rows(problem: Problem) -> Problem | None:
+    """Return a problem without the rows that its biases affect; None if these are all rows of an epoch, or none."""
+    affected = np.zeros(problem.count, dtype=bool)
+    for bias in problem.biases:
+        affected[bias.row] = True
+    if not affected.any() or len(np.unique(problem.epoch[~affected])) < len(np.unique(problem.epoch)):
+        return None
+    return problem.with_rows(weight=np.where(affected, 0.0, problem.weight))
+
+
+def _from_rows(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
+    """Return one starting vector (N, 1, size) as if no bias affected the rows."""
     x = vectors(problem, None)[:, None]
     n, length = problem.layout.n_shared, problem.layout.n_local
     known = {prior.name for prior in problem.priors}

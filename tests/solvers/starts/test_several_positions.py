@@ -133,3 +133,17 @@ def test_biases_that_are_large_but_roughly_known_do_not_mislead_the_start(kind, 
     fix, started = solve(drawn), solve(drawn, "lsr", start=truth)
     assert fix.answered.all()
     assert np.all(fix.cost <= started.cost * (1.0 + 1e-6) + 1e-6)
+
+
+def test_a_large_error_of_one_station_has_a_start_without_its_rows():
+    stations = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0], [90.0, 80.0], [-40.0, 50.0]])
+    way = np.column_stack([np.linspace(20.0, 70.0, 6), np.linspace(30.0, 60.0, 6)])
+    a, epoch = np.tile(np.arange(5), 6), np.repeat(np.arange(6), 5)
+    template = assemble(stations, measured("range", a=a, epoch=epoch, sigma=0.1), motions=(Motion(span="epoch"),))
+    problem = with_bias(template, "offset", members=[template.stations.names[4]])
+    drawn = simulate(problem, np.append(60.0, way), 2).flat()
+    start = from_pieces(drawn, lambda piece: solve(piece, "roots+lsr"))
+    error = np.abs(problem.layout.split(start)[1][0] - way).max((-1, -2))
+    assert error.shape == (2,)
+    assert error[0] > 5.0
+    assert error[1] < 1.0
