@@ -67,14 +67,14 @@ class Account:
         with self._lock:
             return {source: dict(found) for source, found in self._counts.items()}
 
-    def for_checkpoint(self, held: Mapping[str, int]) -> dict[str, dict[str, int]]:
-        """Return the counts for a checkpoint, in which only the lines `held` by the events of the checkpoint are open.
+    def for_checkpoint(self, waiting: Mapping[str, int]) -> dict[str, dict[str, int]]:
+        """Return the counts for a checkpoint, in which only the `waiting` lines of its events are open, by source.
 
         Lines that wait in a queue are not in the checkpoint, so they do not count as received.
         """
         out = {}
         for source, found in self.records().items():
-            open_lines = held.get(source, 0)
+            open_lines = waiting.get(source, 0)
             settled = {state: found[state] for state in SETTLED}
             out[source] = {"received": sum(settled.values()) + open_lines, **settled, "open": open_lines}
         return out
@@ -84,10 +84,10 @@ class Account:
         with self._lock:
             self._counts = {source: Counter(found) for source, found in stored.items()}
 
-    def difference(self, held: Mapping[str, int]) -> dict[str, int]:
-        """Return by source how many open lines differ from the lines `held` in queues and events; empty if none do."""
+    def difference(self, waiting: Mapping[str, int]) -> dict[str, int]:
+        """Return by source the open lines minus the lines `waiting` in queues and events; empty if they are equal."""
         counts = self.records()
-        found = {source: counts[source]["open"] - held.get(source, 0) for source in counts}
+        found = {source: counts[source]["open"] - waiting.get(source, 0) for source in counts}
         return {source: count for source, count in found.items() if count}
 
 

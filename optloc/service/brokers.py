@@ -14,12 +14,12 @@ from optloc.service.queues import WAITING
 from optloc.service.stream import Stream
 from optloc.service.supervisor import LineSource, Watch
 
-# Seconds between two looks at whether a source must end.
-_LOOK = 0.2
+# Seconds between two checks of whether a source must end.
+_CHECK_EVERY = 0.2
 # Seconds after which MQTT tests the connection to a silent broker.
 _KEEPALIVE = 30
 # Seconds to connect to a broker, and then for the TLS handshake, which cannot be interrupted: four round trips over a
-# satellite. The end of the stream waits for both, and for a look.
+# satellite. The end of the stream waits for both.
 _CONNECT = 4.0
 _PATIENCE = 2.0 * _CONNECT + 1.0
 
@@ -66,7 +66,7 @@ def mqtt(stream: Stream, address: str, adapter: Adapter | None = None) -> LineSo
 
         client.on_connect, client.on_message = connected, receive
         while not watch.stopping.is_set():
-            code = client.loop(_LOOK)
+            code = client.loop(_CHECK_EVERY)
             if refusal or code != paho.MQTT_ERR_SUCCESS:
                 raise SourceLost(refusal[0] if refusal else f"the broker is lost ({paho.error_string(code)})")
         client.disconnect()
@@ -128,7 +128,7 @@ def zeromq(stream: Stream, address: str, adapter: Adapter | None = None) -> Line
         context, socket, monitor = opened.pop() if opened else _zeromq_sockets(address)
         try:
             while not watch.stopping.is_set():
-                ready = zmq.select([socket, monitor], [], [], _LOOK)[0]
+                ready = zmq.select([socket, monitor], [], [], _CHECK_EVERY)[0]
                 if monitor in ready:
                     _note_event(monitor, watch, pulls=pulls)
                 if socket not in ready:

@@ -183,7 +183,7 @@ def _account(found: Any) -> dict[str, dict[str, int]]:
     return account
 
 
-def _check_open(account: dict[str, dict[str, int]], held: Counter[str]) -> None:
-    """Raise InvalidProblem if the open lines of an account are not the lines `held` by the open events."""
-    if {source: counts["open"] for source, counts in account.items() if counts["open"]} != +held:
+def _check_open(account: dict[str, dict[str, int]], waiting: Counter[str]) -> None:
+    """Raise InvalidProblem if the open lines of an account are not the `waiting` lines of the open events."""
+    if {source: counts["open"] for source, counts in account.items() if counts["open"]} != +waiting:
         raise InvalidProblem("the open lines of a source are not the lines of the open events", "account", "remove it")

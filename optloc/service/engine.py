@@ -237,7 +237,7 @@ class Engine:
             else:
                 rows = names[keys]
             found.setdefault((tuple(sorted(event.times)), rows), []).append(event)
-        return [group for key, some in found.items() for group in self._group(key, some)]
+        return [group for key, members in found.items() for group in self._group(key, members)]
 
     def _group(self, key: tuple[tuple[int, ...], tuple[SiteRow, ...]], events: list[Event]) -> list[EventGroup]:
         """Return events with equal rows as one group; the result is empty if their rows give no problem.
@@ -426,6 +426,6 @@ def _proof_groups(items: Sequence[Pending]) -> list[EventGroup]:
     for item in items:
         found.setdefault(id(item.ready), []).append(item)
     return [
-        EventGroup(some[0].ready, [item.event for item in some], np.stack([item.z for item in some]))
-        for some in found.values()
+        EventGroup(group[0].ready, [item.event for item in group], np.stack([item.z for item in group]))
+        for group in found.values()
     ]

@@ -167,7 +167,7 @@ class Latest:
     def __init__(self, most: int = 1024) -> None:
         self._most, self._total = most, 0  # `_total` counts the stored fixes since the start
         # by name of the target or event, the oldest first: time of the fix (s since 1970) and record
-        self._held: dict[str, tuple[float, Record]] = {}
+        self._stored: dict[str, tuple[float, Record]] = {}
         # by name of the target: its latest positions, the oldest first, for trails
         self._trails: dict[str, deque[list[float]]] = {}
         # by name of the target: the record of the last request for marks, and its mark
@@ -183,31 +183,31 @@ class Latest:
             return
         self._last = time()
         name = _name_of(record)
-        old = self._held.get(name)
+        old = self._stored.get(name)
         if old is not None and _event_of(old[1]) == _event_of(record):
-            self._held[name] = (old[0], join(old[1], record))
+            self._stored[name] = (old[0], join(old[1], record))
             if record.get("position") is not None:
                 self._trails[name][-1] = record["position"]
             return
         if record.get("position") is None:
             return
         # Each step is one call of a built-in: a reader in another thread gets the old or the new record.
-        self._held.pop(name, None)
-        self._held[name] = (time(), join(None, record))
+        self._stored.pop(name, None)
+        self._stored[name] = (time(), join(None, record))
         if old is None or time() - old[0] > _MAX_AGE:  # a target that returns starts a new trail
             self._trails[name] = deque(maxlen=_TRAIL)
         self._trails[name].append(record["position"])
         self._total += 1
-        if len(self._held) > self._most:
-            gone = next(iter(self._held))
-            self._held.pop(gone, None)
-            self._trails.pop(gone, None)
-            self._drawn.pop(gone, None)
+        if len(self._stored) > self._most:
+            oldest = next(iter(self._stored))
+            self._stored.pop(oldest, None)
+            self._trails.pop(oldest, None)
+            self._drawn.pop(oldest, None)
 
     def _present(self) -> list[tuple[float, Record]]:
         """Return the age (s) and the record of each target with a fix in the last minute."""
         now = time()
-        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _MAX_AGE]
+        return [(now - when, record) for when, record in list(self._stored.values()) if now - when < _MAX_AGE]
 
     def features(self, frame: Frame) -> Record:
         """Return the latest fixes as a GeoJSON feature collection; `frame` is the frame of the site."""

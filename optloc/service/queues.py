@@ -166,13 +166,13 @@ class Inbox:
         """Count lines that no event gets."""
         self._account.settle(state, _by_source(lines))
 
-    def difference(self, held: Counter[str]) -> dict[str, int]:
-        """Return by source how many open lines are neither in this queue nor in `held`; empty if the account is right.
+    def difference(self, waiting: Counter[str]) -> dict[str, int]:
+        """Return by source how many open lines are neither in this queue nor `waiting`; empty if the account is right.
 
-        `held` has the numbers of lines that the reader of the queue holds, by source.
+        `waiting` has the numbers of lines, by source, that the reader of the queue has taken.
         """
         with self._changed:
-            return self._account.difference(held + _by_source(self._lines))
+            return self._account.difference(waiting + _by_source(self._lines))
 
     def drop(self) -> None:
         """Drop all waiting lines, because the stream has ended; their clients get an error."""

@@ -20,8 +20,8 @@ from optloc.service.supervisor import LineSource, Watch
 _UNCOUNTED = 0.98
 # Restarts of a failing standard input: an error of a terminal may pass, an error of a device does not.
 _TRIES = 3
-# Seconds between two looks at whether the source must end.
-_LOOK = 0.2
+# Seconds between two checks of whether the source must end.
+_CHECK_EVERY = 0.2
 
 
 class Input(NamedTuple):
@@ -75,7 +75,7 @@ def standard_input(stream: Stream, source: Input, adapter: Adapter | None = None
 
         def read(count: int) -> bytes | None:
             """Return at most `count` bytes; None if the source is stopped."""
-            while wait is not None and not wait(_LOOK):
+            while wait is not None and not wait(_CHECK_EVERY):
                 if watch.stopping.is_set():
                     return None
             data = source.read(count)

@@ -37,7 +37,7 @@ from optloc.service.tracks import Tracks, TrackSettings
 
 LOG = logging.getLogger("optloc.service")
 
-# Lines between two looks at the clock: a timer is late by their time, some milliseconds.
+# Lines between two readings of the clock: a timer is late by their time, a few milliseconds.
 _LINES = 256
 # Seconds between checks of whether a reader has read its available input.
 _PAUSE = 1e-3
@@ -457,8 +457,8 @@ class Stream:
     def _check_account(self) -> None:
         """Compare the open lines of the account with the lines in queues and events; a difference is an alarm."""
         with self._settling:
-            held = total(event.lines for event in (*self._unsettled.values(), *self._events.open.values()))
-            found = self.inbox.difference(held)
+            waiting = total(event.lines for event in (*self._unsettled.values(), *self._events.open.values()))
+            found = self.inbox.difference(waiting)
         if found and self._imbalance is None:
             source, count = next(iter(found.items()))
             self._imbalance = Alarm(f"{count} open lines of {source} are in no queue and no event", self.clock())

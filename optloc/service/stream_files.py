@@ -91,7 +91,7 @@ class StreamFiles:
             self._lines, self._count = bytearray(), 0
 
     def close(self) -> None:
-        """Write what waits, for some seconds at most, and release the state."""
+        """Write the waiting entries, for `PATIENCE` seconds at most, and release the state."""
         self.write_record()
         for output in self.outputs:
             output.close()

@@ -65,7 +65,7 @@ def test_ids_of_clients_do_not_meet(server, z):
         assert (code, record["event"], record.get("client")) == (200, "same", client)
     by_key = json.loads(ask(port, "POST", "/fix", line(event="same", client="cellar", z=z[2]))[2])
     assert by_key == record
-    names = {(r.get("client"), r["event"]) for _, r in stream.latest._held.values()}
+    names = {(r.get("client"), r["event"]) for _, r in stream.latest._stored.values()}
     assert {(None, "same"), ("roof", "same"), ("cellar", "same")} <= names
     code, _, said = ask(port, "POST", "/fix", line(event="same", client="roof", z=z[2]), **ONE, X_Client="cellar")
     assert (code, "the key 'client' occurs twice" in said) == (400, True)
