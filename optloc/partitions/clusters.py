@@ -75,8 +75,9 @@ def _local_dask(jobs: int) -> Iterator[Any]:
 
     # Without a page of statistics, and without warnings about workers that end with the cluster.
     options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+    preload = [*dask.config.get("distributed.worker.preload", []), "optloc.partitions.worker_start"]
     # The settings stay until the cluster ends: a worker that replaces a lost worker reads them when it starts.
-    with dask.config.set(_LOCAL_CLUSTER), LocalCluster(n_workers=jobs, **options) as cluster:
+    with dask.config.set(_LOCAL_CLUSTER), LocalCluster(n_workers=jobs, preload=preload, **options) as cluster:
         yield cluster
 
 

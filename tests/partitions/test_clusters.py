@@ -1,5 +1,6 @@
 """Clusters: one that does not reply is one sentence, and local workers keep the memory that they use again."""
 
+import gc
 import os
 
 import pytest
@@ -19,7 +20,8 @@ def test_an_unreachable_scheduler_is_one_sentence(monkeypatch):
 def settings(_):
     import dask
 
-    return os.environ.get("MALLOC_TRIM_THRESHOLD_"), dask.config.get("distributed.worker.profile.enabled")
+    variable = os.environ.get("MALLOC_TRIM_THRESHOLD_")
+    return variable, dask.config.get("distributed.worker.profile.enabled"), gc.get_threshold()[0]
 
 
 @pytest.mark.slow
@@ -31,6 +33,6 @@ def test_local_workers_do_not_return_memory_after_each_array(monkeypatch):
     monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
     before = dask.config.get("distributed.nanny.pre-spawn-environ")
     with clusters.dask_client(None, 1) as client:
-        assert client.submit(settings, 0).result() == (None, False)
+        assert client.submit(settings, 0).result() == (None, False, 50_000)
     assert dask.config.get("distributed.nanny.pre-spawn-environ") == before
     assert dask.config.get("distributed.worker.profile.enabled")
