@@ -26,7 +26,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # What tests begin is the optloc that they test, not a checkout in the current folder, which has no machine code.
 os.environ["PYTHONSAFEPATH"] = "1"
 
-# Searches for garbage among a million objects of collected tests, which live until the end, take half of the collection.
+# Searches for garbage among a million objects of collected tests, which live until the end, take half of collection.
 gc.disable()
 
 # The command line is put together once, not for each of a thousand commands.

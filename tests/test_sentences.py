@@ -79,6 +79,7 @@ def test_every_status_is_short():
     assert [status.label for status in Status if len(status.sentence) >= MOST] == []
 
 
+@pytest.mark.slow
 def test_every_error_names_a_place_and_a_step():
     """Lines of a stream have no names: who reads them says which line it was, and the key that is wrong."""
     lacking, count = [], 0

@@ -99,7 +99,7 @@ def test_errors_of_stations_in_an_epoch_are_noise_for_health_and_advice(tmp_path
     _, _, events = tables(tmp_path, [7, 8])
     places = (tmp_path / "sites.csv").read_text().splitlines()
     (tmp_path / "s.csv").write_text("\n".join(["name,x,y,z,sigma", *(f"{line},5" for line in places[1:])]) + "\n")
-    rows = [line.split(",") for lines in events for line in lines]
+    rows = [line.split(",") for lines in events[:6] for line in lines]
     (tmp_path / "r.csv").write_text("epoch,a,z\n" + "".join(f"{k},{a},{v}\n" for k, a, v in rows))
     text = 'format = 2\n[stations]\nfile = "s.csv"\n[[measurements]]\nkind = "toa"\nfile = "r.csv"\nunit = "ns"\n'
     (tmp_path / "p.toml").write_text(text + 'sigma = "30 ns"\n')

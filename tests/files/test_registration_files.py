@@ -84,8 +84,13 @@ def test_a_prior_on_all_clocks_leaves_their_common_error_open(tmp_path):
     assert all(0.5 < bias["from_data"] < 0.9 for bias in fix["biases"])
 
 
+def early(table):
+    """Return the rows of the first two minutes, of which commands answer in a moment."""
+    return table[table["time"] < 120.0]
+
+
 def test_clocks_that_nothing_holds_are_named(tmp_path):
-    result = run("fix", copied(tmp_path, lambda text: text.partition("members")[0]), code=1)
+    result = run("fix", copied(tmp_path, lambda text: text.partition("members")[0], rows=early), code=1)
     assert "singular" in result.stdout
     assert "nan" not in result.stdout
 
@@ -113,11 +118,10 @@ def test_epochs_may_come_in_any_order_and_stations_may_be_missing(tmp_path):
     some = copied(tmp_path, rows=lambda t: t.drop(t.index[(t["a"] == "R4") & (t["time"] > 400)]))
     (fix,) = json.loads(run("fix", some, *ALLOW, "--json").stdout)["fixes"]
     assert fix["status"] == "ok"
-    missing = json.loads(run("check", some, "--json").stdout)["rows"]["tdoa"]
-    assert missing == plain.count - (plain.times > 400.0).sum()
+    assert load(some).count == plain.count - (plain.times > 400.0).sum()
 
 
-def test_check_tells_what_a_registration_holds():
+def test_check_tells_what_a_registration_holds(tmp_path):
     found = json.loads(run("check", DEMO, "--json").stdout)
     problem = load(DEMO)
     assert (found["epochs"], found["duration_s"]) == (problem.epochs, np.ptp(problem.times))
@@ -125,7 +129,7 @@ def test_check_tells_what_a_registration_holds():
     assert found["biases"] == {"clock": "offset of R2, R3, R4, R5, unknown"}
     assert found["station_errors"] == "1 m, noise of each epoch"
     assert found["redundancy"]["least"] == problem.count - 7
-    assert "clock" in run("check", DEMO).stdout
+    assert "clock" in run("check", copied(tmp_path, rows=early)).stdout
 
 
 def test_the_bound_in_the_course_of_the_run(tmp_path):

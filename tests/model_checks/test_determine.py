@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from model_checks.small import PLACE, SQUARE as PLAIN, ranges_to
+from often import few
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import chi2
 
@@ -64,8 +65,9 @@ def far_target(rng, places):
     return u, distance, 2.0 * size * np.radians(np.exp(rng.uniform(np.log(0.3), np.log(5.0)))) / np.sqrt(2.0)
 
 
-def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
-    rng, inside, beyond, count = np.random.default_rng(5), 0, 0, 36
+@pytest.mark.parametrize("count", few([18, 36], 1))
+def test_far_sources_are_in_the_cones_and_beyond_the_least_range(count):
+    rng, inside, beyond = np.random.default_rng(5), 0, 0
     for k in range(count):
         places = (SQUARE, SIX, TRIANGLE)[k % 3]
         u, distance, sigma = far_target(rng, places)
@@ -75,9 +77,9 @@ def test_far_sources_are_in_the_cones_and_beyond_the_least_range():
         own = [one for one in found.directions if one.covers(u)]
         inside += bool(own)
         beyond += min(one.least_range for one in own or found.directions) <= distance
-    # 95 % of 36: fewer than 30 happen once in 500 seeds
-    assert inside >= 30
-    assert beyond >= 32
+    # 95 % of 36: fewer than 30 happen once in 500 seeds; of 18, fewer than 15 happen once in 100
+    assert inside >= count * 5 // 6
+    assert beyond >= count * 8 // 9
 
 
 def blank(problem):

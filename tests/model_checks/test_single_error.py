@@ -20,7 +20,7 @@ from tests.monte_carlo.tables import write
 
 SHIPPED = Path(optloc.__file__).parent / "scenarios" / "registration.toml"
 TRUTH = np.array([200e3, 300e3, 0.0, *(0.299792458 * np.array([100.0, -133.0, 167.0, -100.0]))])
-RUNS = 2
+RUNS = 1
 FORMS = ("offset", "scale", "drift", "rotation", "step", "burst")
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from often import few
 
 import optloc
 from optloc import Status, assemble, constraints, measured, solve, station_array
@@ -82,9 +83,10 @@ def ranged(rng, limits, truth, sigma=2.0, count=6):
     return assemble(station_array(place), measured("range", z, a=np.arange(count), sigma=sigma), constraints=demands)
 
 
-def test_most_fixes_in_boxes_are_ok_and_cover_truths_inside_and_on_the_edge():
+@pytest.mark.parametrize("count", few([32, 64], 1))
+def test_most_fixes_in_boxes_are_ok_and_cover_truths_inside_and_on_the_edge(count):
     rng, held, good, inside, edge, wrong = np.random.default_rng(11), 0, 0, [], [], 0
-    for k in range(64):
+    for k in range(count):
         lower = rng.uniform(-25.0, 25.0, 2)
         upper = lower + 10 ** rng.uniform(0.0, 1.2, 2)
         truth = rng.uniform(lower, upper)
@@ -102,10 +104,10 @@ def test_most_fixes_in_boxes_are_ok_and_cover_truths_inside_and_on_the_edge():
             away = np.linalg.norm(grid[:, None] - problem.stations.position[0, 0], axis=-1)
             least = (((problem.z - away) / 2.0) ** 2).sum(1).min()
             wrong += bool(fix.cost > least + 1e-6)
-    assert held > 20
+    assert held > count // 3
     assert good >= 0.8 * held
     assert wrong == 0
-    # 95 % of some 45 and 15: fewer happen by chance once in ten thousand times
+    # 95 % of some 45 and 15 of 64: fewer happen by chance once in ten thousand times, of 32 once in a hundred times
     assert np.mean(inside) > 0.8
     assert np.mean(edge) > 0.7
 

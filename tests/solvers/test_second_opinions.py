@@ -97,8 +97,9 @@ def test_the_relaxation_that_knows_the_height_is_the_answer_of_sdp_alone():
     assert np.median(np.linalg.norm(alone - refined, axis=1)) < 1.0
 
 
+@pytest.mark.parametrize("trials", few([10, 30], 1))
 @pytest.mark.parametrize("order", [0, 1])
-def test_one_receiver_and_one_illuminator_reach_the_minimum_beside_the_truth(order):
+def test_one_receiver_and_one_illuminator_reach_the_minimum_beside_the_truth(order, trials):
     epochs = np.arange(30)
     zero, one = np.zeros_like(epochs), np.ones_like(epochs)
     template = assemble(
@@ -109,7 +110,7 @@ def test_one_receiver_and_one_illuminator_reach_the_minimum_beside_the_truth(ord
         motions=[Motion(order=order)],
     )
     truth = np.array([10031.0, 79960.0, 9962.0, 4.0, 10.0, 6.0])[: 3 * (order + 1)]
-    problem = simulate(template, truth, seed=14, trials=30)
+    problem = simulate(template, truth, seed=14, trials=trials)
     fix, beside = solve(problem), solve(problem, "lsr", start=truth)
     assert alone(fix).all()
     assert fix.has(Status.CURVED).all()  # a degree at 80 km, and ranges of 6 m: an arc

@@ -28,7 +28,7 @@ def run_at(height, anchors=ANCHORS, count=20, sigma=0.05):
 
 @pytest.mark.parametrize("height", [1.0, 10.5])
 def test_the_floor_with_the_least_cost_is_found(height):
-    problem, place = run_at(height)
+    problem, place = run_at(height, count=10)
     found = track_on_floors(problem, (1.0, 4.5, 10.5), polynomial(1, 0.5))
     assert found.height == height
     assert found.margin > 9.0

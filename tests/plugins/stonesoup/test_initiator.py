@@ -31,7 +31,7 @@ def test_rates_begin_a_track_with_its_velocity():
 
 def test_initial_errors_are_those_of_the_covariance():
     rng, values = np.random.default_rng(3), []
-    trials = 30
+    trials = 20
     for _ in range(trials):
         initiator = FixInitiator()
         for time, state, detection in detections(rng, drawn(rng), 12):

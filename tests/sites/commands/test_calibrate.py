@@ -147,6 +147,8 @@ def test_a_network_that_is_open_is_no_site(folder):
 
 
 def test_the_wave_speed_of_a_network_is_an_option(folder):
+    lines = (folder / "pulses.csv").read_text().splitlines()
+    (folder / "pulses.csv").write_text("\n".join(lines[: 1 + 12 * 8]))  # twelve pulses at eight stations are enough
     text = (folder / "hall.toml").read_text().replace('sigma = "3 cm"', 'unit = "s"\nsigma = "0.1 ms"')
     (folder / "hall.toml").write_text(text)
     by_option = read_network(folder / "hall.toml", "air:20C")

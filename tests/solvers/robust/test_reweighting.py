@@ -270,7 +270,7 @@ def test_a_run_with_biases_bears_wild_rows():
 
 @pytest.mark.parametrize("name", few(REDESCENDING, 1))
 @pytest.mark.parametrize("epochs", few([8, 4], 1))
-@pytest.mark.parametrize("trials", [6, pytest.param(40, marks=pytest.mark.full)])
+@pytest.mark.parametrize("trials", [4, pytest.param(40, marks=pytest.mark.full)])
 def test_a_moving_target_is_found_with_one_row_in_five_wrong(name, epochs, trials):
     lost = []
     for seed in range(1000, 1000 + trials):
