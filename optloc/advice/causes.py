@@ -18,6 +18,7 @@ from optloc.advice.wording import no_words
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
 from optloc.model_checks.cause import Advice
+from optloc.problem.noise import variances
 from optloc.solvers.solution import solve
 
 # Smallest price of any explanation: a misfit of a smaller cost has no cause.
@@ -94,9 +95,23 @@ def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:
         lines = f"weight = {level**-2:.6g}\n" if simple else ""
         return Wording(seen, "state a larger noise, or use `--rescale-noise` for several epochs", lines)
 
-    none = np.zeros(0)
+    none, score = np.zeros(0), score_of_level(cost, dof) + _price_of_width(case, level)
     change = Change("noise", words, spread=level, levels=True)
-    return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0], case)
+    return Scored(change, none, none, float(dof), dof, score, plain.x[0], case)
+
+
+def _price_of_width(case: MisfitCase, level: float) -> float:
+    """Return the price of noise that is larger than the station array, or than half a turn.
+
+    Smaller noise costs nothing in the rows that determine the positions, because the positions follow the noise.
+    Positions that follow larger noise are as unlikely as the noise.
+    """
+    width = np.full(case.base.count, np.inf)
+    width[case.rows_where("length")], width[case.rows_where("angle")] = case.extent, np.pi
+    size = level * np.sqrt(variances(case.base.noise, case.base.count)) / width
+    over = 2.0 * np.log(np.maximum(size, 1.0)) * np.ones(case.present.shape)
+    fixing = int(case.present.sum()) - int(case.dof.sum())
+    return fixing * float(over[case.present].mean())
 
 
 def _of_late_rows(case: MisfitCase) -> Iterator[Scored]:

@@ -63,7 +63,7 @@ def _common_height(case: MisfitCase, free: Change) -> Iterator[Change]:
     root, _ = linalg.root(joined(other.base, equations_at(other.base, x))[0])
     variance = ((up[:, None] @ root[:, part])[:, 0] ** 2).sum(-1)
     level = float((height / variance).sum() / (1.0 / variance).sum())
-    moved = replace(band, lower=np.float64(level), upper=np.float64(level))
+    moved = replace(band, lower=np.array(level), upper=np.array(level))
     constraints = tuple(moved if c is band else c for c in case.base.constraints)
     words = partial(_common_words, level, float(np.sqrt(1.0 / (1.0 / variance).sum())))
     yield Change("height", words, base=replace(case.base, constraints=constraints), extra=1)

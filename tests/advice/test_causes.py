@@ -7,6 +7,7 @@ from advice.cases import PLACES, TRUTHS, at, range_case
 
 from optloc.advice.causes import advice_on, causes_of
 from optloc.advice.scores import GAP
+from optloc.problem.written import Written
 
 
 def test_clean_data_have_no_cause():
@@ -40,3 +41,10 @@ def test_an_epoch_that_nothing_determines_does_not_hide_the_cause_of_the_others(
     found = causes_of(replace(case, base=base))
     assert {one.change.cause for one in found} == {"offset"}
     assert len(found[0].case.times) == 3
+
+
+def test_noise_that_is_larger_than_the_array_is_no_better_than_a_unit():
+    case, _ = range_case(epochs=4, sigma=0.01)
+    written = Written(units={"range": 1e3}, noise_has_unit=True)
+    base = replace(case.base.with_rows(z=1e5 * case.base.z), written=written)
+    assert [one.change.cause for one in causes_of(replace(case, base=base))][:1] == ["unit"]
