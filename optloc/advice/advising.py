@@ -81,7 +81,7 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
 def _on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     """Yield the advice on the values of a flat batch of one problem at `x` (1, size)."""
     case = case_of(problem, x)
-    found = () if case is None else verified(case, causes_of(case))
+    found = () if case is None else verified(causes_of(case))
     if not found and case is not None and problem.constraints:
         yield from constraint_advice(case)
     # a cause that explains the data explains impossible values, too; larger noise does not

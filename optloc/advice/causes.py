@@ -18,6 +18,7 @@ from optloc.advice.wording import no_words
 from optloc.base.types import Array
 from optloc.kernels.sums import equations_at
 from optloc.model_checks.cause import Advice
+from optloc.problem.noise import variances
 from optloc.solvers.solution import solve
 
 # Smallest price of any explanation: a misfit of a smaller cost has no cause.
@@ -31,9 +32,20 @@ _EQUAL = 1e-3
 def causes_of(case: MisfitCase) -> tuple[Scored, ...]:
     """Return the explanations that the data do not exclude, the best first; empty if none is needed.
 
-    The first is alone if all others score worse by the gap.
+    The first is alone if all others score worse by the gap. An epoch that the data determine after no change excludes
+    all causes, so that the others are compared without it.
     """
     plain = fit(case, [Change("none", no_words)])
+    found, known = _compared(case, plain), np.flatnonzero(np.isfinite(plain.cost[0]))
+    # errors of all rows count without a determined position
+    if all(one.change.cause in ("noise", "late") for one in found) and 0 < len(known) < len(case.times):
+        part = case.in_epochs(known)
+        return _compared(part, Fits(plain.x[:, known], plain.theta, plain.sigma, plain.cost[:, known])) or found
+    return found
+
+
+def _compared(case: MisfitCase, plain: Fits) -> tuple[Scored, ...]:
+    """Return the explanations that the data do not exclude; `plain` is the fit without a change."""
     cost, dof = float(plain.cost.sum()), int(case.dof.sum())
     if cost >= GAP + _CHEAPEST and not np.isfinite(case.x).all():
         # a direction, or a position that the data determine badly, explains the values without a change
@@ -83,9 +95,23 @@ def _of_level(case: MisfitCase, plain: Fits, cost: float, dof: int) -> Scored:
         lines = f"weight = {level**-2:.6g}\n" if simple else ""
         return Wording(seen, "state a larger noise, or use `--rescale-noise` for several epochs", lines)
 
-    none = np.zeros(0)
+    none, score = np.zeros(0), score_of_level(cost, dof) + _price_of_width(case, level)
     change = Change("noise", words, spread=level, levels=True)
-    return Scored(change, none, none, float(dof), dof, score_of_level(cost, dof), plain.x[0])
+    return Scored(change, none, none, float(dof), dof, score, plain.x[0], case)
+
+
+def _price_of_width(case: MisfitCase, level: float) -> float:
+    """Return the price of noise that is larger than the station array, or than half a turn.
+
+    Smaller noise costs nothing in the rows that determine the positions, because the positions follow the noise.
+    Positions that follow larger noise are as unlikely as the noise.
+    """
+    width = np.full(case.base.count, np.inf)
+    width[case.rows_where("length")], width[case.rows_where("angle")] = case.extent, np.pi
+    size = level * np.sqrt(variances(case.base.noise, case.base.count)) / width
+    over = 2.0 * np.log(np.maximum(size, 1.0)) * np.ones(case.present.shape)
+    fixing = int(case.present.sum()) - int(case.dof.sum())
+    return fixing * float(over[case.present].mean())
 
 
 def _of_late_rows(case: MisfitCase) -> Iterator[Scored]:
@@ -96,7 +122,7 @@ def _of_late_rows(case: MisfitCase) -> Iterator[Scored]:
         dof = int(case.dof.sum()) - 2
         price = LATE_PRICE + price_of_parameters(np.zeros(2), np.ones(2))
         # residuals of late rows have no chi-square
-        yield Scored(change, theta, np.zeros(2), np.nan, dof, found.score + price, found.x)
+        yield Scored(change, theta, np.zeros(2), np.nan, dof, found.score + price, found.x, case)
 
 
 def _distinct(found: Sequence[Scored]) -> Iterator[Scored]:

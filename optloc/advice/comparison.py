@@ -7,13 +7,12 @@ listed. Its least score has the costs of rows that it does not affect, and the p
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from optloc.advice.change import Change, MisfitCase
 from optloc.advice.explanation_table import EXPLANATIONS
-from optloc.advice.fits import Fits, fit
+from optloc.advice.fits import Fits, fit, in_base
 from optloc.advice.scores import GAP, Scored, least_score, scored
 from optloc.advice.suspects import Suspects
 from optloc.base.types import Array
@@ -72,7 +71,7 @@ def compare_all(comparison: Comparison) -> None:
     own = [one for one in left if one[0].base is None]
     for change, odds in left:
         if change.base is not None and least_score(case, change, odds) < comparison.limit:
-            other = _in_base(case, change)
+            other = in_base(case, change)
             comparison.add(scored(other, [change], fit(other, [change]), [odds]))
     comparison.compare([one for one in own if one[0].x is not None])
     rows = [one for one in own if one[0].x is None and one[0].members]
@@ -119,16 +118,3 @@ def _telling_epochs(case: MisfitCase) -> Array:
     """Return the numbers of a few epochs in which a wrong change has a large cost."""
     cost = case.dof if case.cost is None else np.where(np.isfinite(case.cost), case.cost, np.inf)
     return np.lexsort((-case.dof, -cost))[:_FIRST_EPOCHS]
-
-
-def _in_base(case: MisfitCase, change: Change) -> MisfitCase:
-    """Return the case in the structure that a change states."""
-    assert change.base is not None
-    x = np.zeros((len(case.times), change.base.layout.size))
-    new, old = change.base.layout, case.base.layout
-    for slot in old.shared:
-        there, _ = new.find(slot.name)
-        size = min(slot.size, there.size)
-        x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
-    x[:, new.n_shared :] = case.x[:, old.n_shared :]
-    return replace(case, base=change.base, x=x, cost=None)

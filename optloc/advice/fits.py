@@ -93,6 +93,19 @@ def changed(case: MisfitCase, changes: Sequence[Change], theta: Array) -> Proble
     return _relocated(case, lanes, changes, theta)
 
 
+def in_base(case: MisfitCase, change: Change) -> MisfitCase:
+    """Return the case in the structure that a change states."""
+    assert change.base is not None
+    x = np.zeros((len(case.times), change.base.layout.size))
+    new, old = change.base.layout, case.base.layout
+    for slot in old.shared:
+        there, _ = new.find(slot.name)
+        size = min(slot.size, there.size)
+        x[:, there.start : there.start + size] = case.x[:, slot.start : slot.start + size]
+    x[:, new.n_shared :] = case.x[:, old.n_shared :]
+    return replace(case, base=change.base, x=x, cost=None)
+
+
 def _rescaled(noise: Noise, size: Array) -> Noise:
     """Return the noise of all lanes, with the standard deviations multiplied by `size` (E, K, m)."""
     blocks = []
@@ -201,7 +214,7 @@ def _system(case: MisfitCase, changes: Sequence[Change], theta: Array, x: Array)
     stacked = np.concatenate([linear.residual[..., None], jacobian, columns], axis=-1)
     white = np.concatenate([whitener.apply(stacked) for whitener in linear.noise], axis=-2)
     n, equations = shape[-1], equations_at(lanes, flat)
-    information, vector = _joined(lanes, equations)
+    information, vector = joined(lanes, equations)
     columns = white[..., 1 + n :]
     coupling = np.swapaxes(white[..., 1 : 1 + n], -1, -2) @ columns
     parts = (white[..., 0], columns, information, vector, coupling)
@@ -221,7 +234,7 @@ def _dense(problem: Problem, shared: Array, local: Array) -> Array:
     return out
 
 
-def _joined(problem: Problem, equations: Normal) -> tuple[Array, Array]:
+def joined(problem: Problem, equations: Normal) -> tuple[Array, Array]:
     """Return the information (L, size, size) and the right side (L, size) of all unknowns."""
     n, length, k = problem.layout.n_shared, problem.layout.n_local, problem.epochs
     size, count = n + k * length, len(equations.shared)

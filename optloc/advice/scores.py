@@ -48,6 +48,8 @@ class Scored:
         Cost plus prices.
     x : array (K, size)
         Unknowns after the change.
+    case : MisfitCase
+        The epochs that are explained.
     """
 
     change: Change
@@ -57,6 +59,7 @@ class Scored:
     dof: int
     score: float
     x: Array
+    case: MisfitCase
 
     @property
     def p(self) -> float:
@@ -116,5 +119,5 @@ def scored(case: MisfitCase, changes: Sequence[Change], fits: Fits, odds: Sequen
         if change.admits is not None and not change.admits(theta):
             continue
         score = cost + _price_of_change(case, change, odds[e]) + price_of_parameters(theta, sigma)
-        out.append(Scored(change, theta, sigma, cost, dof, score, fits.x[e]))
+        out.append(Scored(change, theta, sigma, cost, dof, score, fits.x[e], case))
     return out

@@ -34,7 +34,9 @@ def unit_of(kind: str) -> str:
 def bias_lines(
     case: MisfitCase, form: str, per: str, kind: str, members: Sequence[str] = (), mean: str = "", sigma: str = ""
 ) -> str:
-    """Return the lines of a problem file that model an error as a bias."""
+    """Return the lines of a problem file that model an error as a bias; empty if the file cannot have this bias."""
+    if case.base.constraints and len(case.times) > 1:
+        return ""  # a constraint of a target that is free in each epoch excludes unknowns that epochs share
     used = {bias.name for bias in case.base.biases}
     name = next(text for text in (form, *(f"{form} {i}" for i in range(2, 99))) if text not in used)
     lines = [f'name = "{name}"', f'form = "{form}"', f'per = "{per}"', f'kind = "{kind}"']

@@ -79,7 +79,10 @@ def right(draw: Draw, found: Verdict, cause: str, stations: tuple[int, ...]) -> 
     if cause == draw.cause:
         return not draw.stations or stations == draw.stations
     if {cause, draw.cause} == {"unit", "coordinate-unit"}:
-        cost = {name: min(one.cost for one in found.scores if one.cause == name) for name in (cause, draw.cause)}
+        cost = {
+            name: min((one.cost for one in found.scores if one.cause == name), default=np.inf)
+            for name in (cause, draw.cause)
+        }
         return bool(abs(cost[cause] - cost[draw.cause]) < 1.0)
     single = len(draw.data.z) == 1 and stations == draw.stations
     return single and {cause, draw.cause} <= {"offset", "outlier", "drift", "moved"}

@@ -250,7 +250,9 @@ def _outliers(rng: np.random.Generator, data: Data, count: int) -> Planted:
     z, size = data.z.copy(), np.inf
     for row in rows:
         one, error = _error(rng, data)
-        z.flat[row] += error
+        # a negative range is refused before the fix
+        negative = data.kind[row % len(data.kind)] in ("range", "range_sum") and z.flat[row] + error < 0.0
+        z.flat[row] += abs(error) if negative else error
         size = min(size, abs(one))
     return replace(data, z=z), tuple(sorted({int(data.a[row % len(data.a)]) for row in rows})), size
 
