@@ -16,6 +16,8 @@ from optloc.show.answer_texts import (
     NOT_DETERMINED,
     as_p,
     finite,
+    latlon_texts,
+    length_text,
     place_rows,
     sigma_of,
     sure_rows,
@@ -283,10 +285,10 @@ def alternative_sheet(fix: Fix) -> FixSheet | None:
         # Print at most six coordinates: the two positions of a pair of targets.
         on_earth = alternative_latlon(fix, x)
         if on_earth is None:
-            point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
+            point = ", ".join(length_text(v) for v in np.ravel(alternative_position(fix, x))[:6])
         else:
             places = on_earth.reshape(-1, 3)[:2].tolist()
-            point = ", ".join(f"{lat:.6f}, {lon:.6f}, {height:.1f}" for lat, lon, height in places)
+            point = ", ".join(", ".join([*latlon_texts(*place[:2]), length_text(place[2])]) for place in places)
         rows.append((str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}"))
     what = "position, m" if fix.frame.kind == "cartesian" else "latitude, longitude, height in m"
     return FixSheet("Alternatives", ("#", what, "cost gap", "probability"), rows)

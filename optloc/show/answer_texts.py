@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -17,6 +17,10 @@ from optloc.show.origin_time import origin_text
 # If an equality fixes a coordinate, its computed sigma is rounding error: below this share of the coordinate.
 _HELD = 1e-12
 _EARTH = 6.4e6
+# Decimals of a degree that show a metre: 1e-5 degrees of latitude are 1.1 m.
+_METRE = 5
+# Without a standard deviation, lengths in metres show decimetres.
+_DECIMETRE = 1
 # A length below this share of the largest length is rounding error, for instance the sigma of a fixed height.
 _NOTHING = 1e-6
 # p-value below which the text warns of large residuals: by chance this happens in one of 1000 correct fixes.
@@ -57,6 +61,38 @@ def decimals(sigma: float) -> int:
     return int(max(0, 1 - np.floor(np.log10(sigma))))
 
 
+def latlon_texts(lat: float, lon: float, sigmas: Sequence[float] = ()) -> list[str]:
+    """Return latitude and longitude, degrees, as numbers with equally many decimals.
+
+    They have two digits of the smallest standard deviation in `sigmas`, m, and at least a metre. Standard deviations
+    that are not finite, or only rounding error, do not count.
+    """
+    known = [sigma for sigma in sigmas if _HELD * _EARTH < sigma < np.inf]
+    digits = _METRE + (decimals(min(known)) if known else _DECIMETRE)
+    return [f"{lat:.{digits}f}", f"{lon:.{digits}f}"]
+
+
+def height_text(height: float, sigma: float = np.nan) -> str:
+    """Return a height, m, as a number with two digits of its standard deviation, m; "(held)" marks a given height."""
+    if sigma <= _HELD * _EARTH:
+        # The conversion of frames leaves rounding error, which is no digit of the given height.
+        return f"{float(rounded(height, 4)):.10g} m (held)"
+    return f"{length_text(height, sigma)} m"
+
+
+def length_text(value: float, sigma: float = np.nan) -> str:
+    """Return a coordinate, m, as a number with two digits of its standard deviation, m; all digits if it is held."""
+    if sigma <= _HELD * (1.0 + abs(value)):
+        return f"{value:.10g}"
+    return rounded(value, decimals(sigma) if np.isfinite(sigma) else _DECIMETRE)
+
+
+def level_sigmas(columns: Columns, i: int) -> list[float]:
+    """Return the standard deviations, m, of row `i` along east, north and up; NaN if unknown, 0 for rounding error."""
+    variances = [float(columns[f"cov_{2 * axis}"][i]) if f"cov_{2 * axis}" in columns else np.nan for axis in "enu"]
+    return np.sqrt(np.maximum(variances, 0.0)).tolist()
+
+
 def rounded(value: float, digits: int) -> str:
     """Return a number with a number of decimals, and without a minus sign before zero."""
     text = f"{value:.{digits}f}"
@@ -78,16 +114,12 @@ def place_rows(columns: Columns, i: int) -> list[Row]:
     """
     if "lat_deg" not in columns or not np.isfinite(columns["x"][i]):
         return frame_rows(columns, i)
-    undetermined = undetermined_names(columns, i)
-    lat, lon = f"{columns['lat_deg'][i]:.7f} deg", f"{columns['lon_deg'][i]:.7f} deg"
-    # Without a third coordinate, the height is the height of the plane.
-    vertical = columns["cov_uu"][i] if "cov_uu" in columns else np.nan
-    held = " (held)" if vertical < (_HELD * _EARTH) ** 2 else ""
-    height = f"{rounded(columns['height'][i], 2)} m{held}"
+    undetermined, (east, north, up) = undetermined_names(columns, i), level_sigmas(columns, i)
+    lat, lon = latlon_texts(columns["lat_deg"][i], columns["lon_deg"][i], (east, north))
     return [
-        ("latitude", NOT_DETERMINED if "north" in undetermined else lat),
-        ("longitude", NOT_DETERMINED if "east" in undetermined else lon),
-        ("height", NOT_DETERMINED if "up" in undetermined else height),
+        ("latitude", NOT_DETERMINED if "north" in undetermined else f"{lat} deg"),
+        ("longitude", NOT_DETERMINED if "east" in undetermined else f"{lon} deg"),
+        ("height", NOT_DETERMINED if "up" in undetermined else height_text(columns["height"][i], up)),
     ]
 
 

@@ -9,6 +9,9 @@ from optloc.show.answer_texts import (
     NOT_DETERMINED,
     as_p,
     frame_rows,
+    height_text,
+    latlon_texts,
+    length_text,
     lengths,
     place_rows,
     region_rows,
@@ -49,6 +52,31 @@ def test_on_earth_latitude_longitude_and_height_come_first():
     assert [label for label, _ in place_rows(columns, 0)] == ["latitude", "longitude", "height"]
     assert dict(frame_rows(columns, 0))["x"] == with_sigma(fix.position[0], fix.sigma()[0], "m")
     assert [label for label, _ in place_rows(fix_columns(singles()["ok in a plain frame"]), 0)] == ["x", "y"]
+
+
+@pytest.mark.parametrize(
+    ("north", "up", "latitude", "height"),
+    [
+        (120.0, 31.0, "48.12346", "132"),
+        (3.1, 3.1, "48.123457", "132.1"),
+        (0.031, 0.31, "48.12345679", "132.12"),
+        (np.inf, np.inf, "48.123457", "132.1"),
+    ],
+)
+def test_coordinates_on_earth_are_rounded_to_their_errors(north, up, latitude, height):
+    assert latlon_texts(48.123456789, 8.0, (2 * north, north))[0] == latitude
+    assert height_text(132.1234, up) == f"{height} m"
+
+
+def test_a_held_height_has_the_digits_that_were_given():
+    assert height_text(120.125 + 2e-9, 1e-9) == "120.125 m (held)"
+    assert height_text(-2e-9, 0.0) == "0 m (held)"
+    assert latlon_texts(1.0, 2.0, (1e-9, 3.0)) == ["1.000000", "2.000000"]
+
+
+def test_an_alternative_without_errors_shows_decimetres():
+    assert latlon_texts(48.123456789, 8.0) == ["48.123457", "8.000000"]
+    assert length_text(-0.001) == "0.0"
 
 
 def test_a_coordinate_that_is_not_determined_has_no_number():

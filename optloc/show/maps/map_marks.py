@@ -13,8 +13,8 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.show.answer_texts import place_rows, sure_rows
-from optloc.show.columns import Columns, fix_columns, join_tables, level_covariance
+from optloc.show.answer_texts import latlon_texts, length_text, level_sigmas, place_rows, sigma_of, sure_rows
+from optloc.show.columns import Columns, fix_columns, join_tables
 from optloc.show.maps.canvas import MapRow
 from optloc.show.origin_time import FIRST_DATE
 from optloc.show.pictures.outlines import level_planes
@@ -28,11 +28,6 @@ ELLIPSES = 200
 """Maximum number of ellipses on a map: more are unreadable, and each ellipse adds 70 corners to the file."""
 SKY = 100e3
 """Height, m, at which space begins by convention. Satellites have no position on a map."""
-# Decimals of a degree: 5 are a metre. Small ellipses get more, up to 8, a millimetre.
-_DECIMALS, _MOST_DECIMALS = 5, 8
-
-# A variance below this share of the largest variance is rounding.
-_ROUNDING = 1e-12
 
 LOOKS = {
     "ok": "ok",
@@ -219,30 +214,16 @@ def map_row(frame: Frame, columns: Columns, i: int, name: str = "", time: float 
     position = np.array([columns[axis][i] for axis in "xyz" if axis in columns], dtype=float)
     if not np.isfinite(position).all():
         return replace(row, place="", size="no position")
-    # The variance of a coordinate that a constraint fixes is rounding, and can be negative.
-    variance = np.diagonal(level_covariance(columns, i))
-    sigma = np.sqrt(np.where(variance > _ROUNDING * np.max(variance), variance, np.nan))
     sizes = [f"{label}: {text}" for label, text in sure_rows(columns, i)]
     if not frame.geodetic:
-        digits = _decimals(sigma, 1)
-        values = [f"{value:.{digits}f}" for value in position]
-        shown = ", ".join(f"{axis} {value} m" for axis, value in zip("xyz", values, strict=False))
+        axes = "xyz"[: len(position)]
+        values = [length_text(value, sigma_of(columns, axis, i)) for axis, value in zip(axes, position, strict=True)]
+        shown = ", ".join(f"{axis} {value} m" for axis, value in zip(axes, values, strict=True))
         return replace(row, place=shown, copied=", ".join(values), size="; ".join(sizes))
     places = dict(place_rows(columns, i))
-    digits = _decimals(sigma[:2], _DECIMALS)
-    place = f"{columns['lat_deg'][i]:.{digits}f}, {columns['lon_deg'][i]:.{digits}f}"
+    place = ", ".join(latlon_texts(columns["lat_deg"][i], columns["lon_deg"][i], level_sigmas(columns, i)[:2]))
     tall = [f"height: {places['height']}"] if len(position) > 2 else []
     return replace(row, place=place, copied=place, size="; ".join([*tall, *sizes]))
-
-
-def _decimals(sigma: Array, least: int) -> int:
-    """Return the number of decimals of a coordinate: `least` for standard deviations `sigma` (d,) of a metre or more.
-
-    Each factor of ten below a metre adds one decimal, at most three.
-    """
-    known = sigma[np.isfinite(sigma) & (sigma > 0.0)]
-    extra = int(np.ceil(-np.log10(known.min()))) if len(known) else 0
-    return least + min(max(extra, 0), _MOST_DECIMALS - _DECIMALS)
 
 
 def time_text(time: float) -> str:

