@@ -282,3 +282,45 @@ def test_arrivals_keep_the_rows_beside_them(tmp_path):
     scans = json.loads(run(path, "--json").stdout)["scans"]
     # three differences of four arrivals, and the bearing
     assert {scan["rows"] for scan in scans if scan["status"] == "ok"} == {4}
+
+
+def boat(folder, first=1_464_739_218.0):
+    """Write ranges to a boat from four shores, with GPS seconds without a unit, and the stations; return both files."""
+    places, centre = (
+        {"A": (54.30, 10.10), "B": (54.34, 10.20), "C": (54.38, 10.12), "D": (54.33, 10.05)},
+        (54.34, 10.12),
+    )
+    north, east = 111_300.0, 111_300.0 * np.cos(np.radians(centre[0]))
+    rng, rows = np.random.default_rng(2), []
+    for k in range(4):
+        for name, (lat, lon) in places.items():
+            far = np.hypot(60.0 * k - (lon - centre[1]) * east, 30.0 * k - (lat - centre[0]) * north)
+            rows.append({"time": first + 10 * k, "station": name, "range_m": far + 5.0 * rng.standard_normal()})
+    pd.DataFrame(rows).to_csv(folder / "boat.csv", index=False)
+    table = pd.DataFrame([{"name": n, "lat": lat, "lon": lon, "height": 0.0} for n, (lat, lon) in places.items()])
+    table.to_csv(folder / "shore.csv", index=False)
+    return folder / "boat.csv", "--stations", folder / "shore.csv", "--sigma", "50 m", "--height", "0 m"
+
+
+def test_a_table_without_a_unit_of_time_names_the_option(tmp_path):
+    error = sentence(*boat(tmp_path), "-q")
+    assert "the unit of the times in column 'time' is unknown; state it with --time-unit" in error
+
+
+def test_gps_seconds_are_dates_of_a_boat(tmp_path):
+    run(*boat(tmp_path), "--time-scale", "gps", "--out", tmp_path / "boat.gpx")
+    text = (tmp_path / "boat.gpx").read_text()
+    assert "<time>2026-06-06T00:00:10.000Z</time>" in text  # GPS time is 18 s ahead of UTC
+    run(*boat(tmp_path), "--time-unit", "s", "--out", tmp_path / "plain.gpx")
+    assert "<time>" not in (tmp_path / "plain.gpx").read_text()
+    error = sentence(*boat(tmp_path), "--time-unit", "s", "--out", tmp_path / "boat.cot", "-q")
+    assert "Cursor on Target needs dates, but the times have no time scale; state --time-scale" in error
+
+
+def test_a_scale_of_times_needs_numbers(tmp_path):
+    given = boat(tmp_path)
+    table = pd.read_csv(given[0])
+    table["time"] = pd.to_datetime(table["time"], unit="s").dt.strftime("%Y-%m-%dT%H:%M:%SZ")
+    table.to_csv(given[0], index=False)
+    assert "the times of boat.csv are dates, which have the scale utc" in sentence(*given, "--time-scale", "gps", "-q")
+    assert "'gsp' is not a time scale; did you mean 'gps'?" in sentence(*given, "--time-scale", "gsp", "-q")

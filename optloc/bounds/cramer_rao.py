@@ -81,12 +81,15 @@ class Course:
         Bound of the shared unknowns in SI units; NaN where they are not determined yet.
     layout : Layout
         Names and units of the entries.
+    dated : bool
+        Whether the times are since 1970, UTC.
     """
 
     counts: Array
     times: Array
     covariance: Array
     layout: Layout
+    dated: bool = False
 
     def sigma(self, name: str) -> Array:
         """Return the bound (q, size) of the standard deviations of a named unknown, in its SI unit."""
@@ -141,7 +144,7 @@ def crlb_course(
     total, size = (_totals_of_walks if walks(problem) else _totals)(problem, x, chosen)
     prior = shared_priors(problem) + fence_information(problem, x)
     bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
-    return Course(chosen, problem.times[chosen - 1], bound, layout)
+    return Course(chosen, problem.times[chosen - 1], bound, layout, problem.dated)
 
 
 def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Array:

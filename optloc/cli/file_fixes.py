@@ -175,4 +175,4 @@ def answer_of_file(found: FileFixes, advice: Sequence[Advice] = (), most: int = 
 def results_of(found: FileFixes) -> Results:
     """Return the fixes in the form that the export formats need."""
     problem = found.loaded.problem
-    return Results(found.columns, problem.frame, (found.fix,), problem, found.loaded.title)
+    return Results(found.columns, problem.frame, (found.fix,), problem, found.loaded.title, found.loaded.dated)

@@ -150,11 +150,12 @@ def _write(
             from optloc.show.page import LISTED
 
             marks = results_of(found).marks()
-            labels, times = [mark.name for mark in marks], [mark.time for mark in marks]
-            targets = [mark.target for mark in marks]
+            labels = [mark.name for mark in marks]
+            named: dict[str, Any] = {"times": [mark.time for mark in marks], "dated": found.loaded.dated}
+            named["targets"] = [mark.target for mark in marks]
             problem, title = found.loaded.problem, found.loaded.title
             answer = answer_of_file(found, advice, LISTED)
-            page = fix_page(problem, (found.fix,), title, labels, times=times, targets=targets, answer=answer)
+            page = fix_page(problem, (found.fix,), title, labels, **named, answer=answer)
             write_text(html, page)
 
 

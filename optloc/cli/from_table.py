@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.time_scales import TIME_SCALES
 from optloc.cli.completion import choices
 from optloc.cli.options import Budget, Force, Height, Json, Quiet, Verbose
 from optloc.cli.wave import WAVE_OPTIONS, wave_options
@@ -89,6 +90,14 @@ _OPTIONS: dict[str, Any] = {
     ],
     "time_unit": Annotated[
         _TEXT, _option("UNIT", "Unit of the time column, if its name does not end in the unit.", "--time-unit")
+    ],
+    "time_scale": Annotated[
+        _TEXT,
+        _choice(
+            "|".join(TIME_SCALES),
+            "Scale of numbers in the time column, for dates in UTC; without a unit, they are seconds.",
+            "--time-scale",
+        ),
     ],
     "unit": Annotated[
         _TEXT, _option("UNIT", "Unit of the values, if the column name does not end in the unit.", "--unit")

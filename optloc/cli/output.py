@@ -141,8 +141,11 @@ def write_results(path: Path, results: Results) -> None:
     """Write fixes or tracks in the format of the file ending."""
     from optloc.show.formats import format_of
 
-    format_of(path).write(path, results)
+    form = format_of(path)
+    form.write(path, results)
     LOG.info("wrote %s: %d rows", path, len(results.columns["status"]))
+    if form.dated and results.undated:
+        LOG.warning("%s has no dates; state --time-scale for a table, or time_scale under [epochs] of a file", path)
 
 
 def is_csv(path: Path) -> bool:

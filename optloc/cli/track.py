@@ -217,6 +217,11 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
     if all(motion.known is not None for motion in problem.motions):
         raise InvalidProblem("the motion of each target is known", source, "remove the known positions of a target")
     if problem.epochs > 1 and not np.isfinite(loaded.times).all():
+        uses: Mapping[str, str] = loaded.table.get("columns", {})
+        column = next((name for name, role in uses.items() if role == "time"), None)
+        if column is not None:
+            what = f"the unit of the times in column {column!r} is unknown"
+            raise InvalidProblem(what, source, "state it with --time-unit, such as --time-unit s")
         raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
     # With `own_epochs`, each epoch belongs to one target; otherwise targets share epochs, and rows name their target.
     target_of_row = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
@@ -234,7 +239,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
             raise InvalidProblem(what, source, "correct the times, or give both epochs the same label")
         # A file without times has one epoch, so any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
-        run = alone(problem, kept, times)
+        run = replace(alone(problem, kept, times), dated=loaded.dated)
         # Arrival times depend on an unknown emission time; their differences do not.
         run = differences(run) if run.emitting else run
         if not run.count:
@@ -298,7 +303,7 @@ def _map(loaded: Loaded, ones: list[TargetTrack], columns: Columns) -> str:
     pairs = zip(columns["target"].tolist(), columns["epoch"].tolist(), strict=True)
     names = [f"{target} {label}" if len(ones) > 1 else label for target, label in pairs]
     clean = np.isin(columns["status"].astype(str), sorted(CLEAN))
-    marks = scan_spots(loaded.problem, columns, names, clean)
+    marks = scan_spots(loaded.problem, columns, names, clean, dated=loaded.dated)
     return track_page(loaded.problem, marks, loaded.title, answer_of_scans(columns, loaded.title))
 
 
@@ -319,7 +324,7 @@ def _write(
         table.file.finish()
         LOG.info("wrote %s: %d rows", table.path, table.rows)
     elif out is not None:
-        write_results(out, Results(columns, loaded.problem.frame, (), loaded.problem, loaded.title))
+        write_results(out, Results(columns, loaded.problem.frame, (), loaded.problem, loaded.title, loaded.dated))
         if table is not None:
             table.file.discard()
     if plot is not None:

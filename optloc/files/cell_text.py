@@ -300,10 +300,13 @@ def date_texts(seconds: Array) -> Array:
     return np.char.add(texts, "Z").astype(object)
 
 
-def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | None = None) -> Array | None:
+def column_times(
+    roles: Roles, name: str, zone: str | None, told_unit: str | None = None, scale: str | None = None
+) -> Array | None:
     """Return a column of times in seconds (m,); None if its numbers have no unit and so are labels.
 
     `zone` is the time zone of dates without a zone. `told_unit` is the unit if the column name does not end in one.
+    With a time scale, the unit is seconds if nothing states it.
     """
     table = roles.table
     if is_dated(table, name):
@@ -318,6 +321,7 @@ def column_times(roles: Roles, name: str, zone: str | None, told_unit: str | Non
             what = f"the column {name!r} ends in {unit}, not in {told_unit}"
             raise InvalidProblem(what, "--time-unit", "remove it, or state another column with --column time=NAME")
         unit = told_unit if unit is None else unit
+        unit = "s" if unit is None and scale is not None else unit
         if unit is None:
             return None
         values, factor = numbers(table, name), UNITS["time"][unit]

@@ -34,7 +34,7 @@ from optloc.files.pseudoranges import is_gnss
 from optloc.files.reading_report import check_receivers, reading_lines, unused_columns, uses_of
 from optloc.files.roles import ColumnPlaces, Roles, in_space, places_of
 from optloc.files.satellite_tables import AT_RECEPTION, gnss, pseudoranges, write_satellites
-from optloc.files.shapes import epochs_of, read_inline, read_long, read_wide
+from optloc.files.shapes import epoch_lines, epochs_of, read_inline, read_long, read_wide
 from optloc.files.table import Table
 from optloc.files.table_import import (
     CONVENTIONS,
@@ -352,9 +352,7 @@ def _plan(
     notes += [note for note in (heading_note, stations.note) if note]
     notes += dict.fromkeys(note for one in found for note in one.notes if note not in notes)
     lines, after, frame, sections, speeds = _with_waves(sections, found, hints, stations)
-    # With a column "epoch", the window was already used to make its labels.
-    if hints.window is not None and "epoch" not in epochs:
-        after += ("", "[epochs]", f"window = {json.dumps(hints.window)}")
+    after += epoch_lines(hints, epochs, roles.table.source)
     replaced = [name for name in rest if is_sigma(stem(name))] if hints.sigma is not None else []
     notes += [f"--sigma replaces the column {name}; remove one of them" for name in replaced]
     height, note = _height(found, stations)

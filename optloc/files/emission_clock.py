@@ -11,11 +11,13 @@ import numpy as np
 from optloc.base.types import Array, Bias
 from optloc.base.units import UNITS
 from optloc.files.measurements import RowChunk
+from optloc.files.row_epochs import Epochs
 from optloc.models.phase_layers import S_TOA
 from optloc.problem.forms import form_of
 
 After = Literal["time", "date"]
-"""Meaning of the column time of arrivals: values are seconds after it; a date is in seconds since 1970, UTC."""
+"""Meaning of the column time of arrivals: values are seconds after it; a date is in seconds since 1970, UTC. With a
+time scale, numbers are dates too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,7 @@ class EmissionClock:
 
 
 def emission_clock(
-    chunks: Sequence[RowChunk], index: Sequence[Array], numbers: Sequence[Array], biases: Sequence[Bias], count: int
+    chunks: Sequence[RowChunk], index: Sequence[Array], numbers: Sequence[Array], biases: Sequence[Bias], epochs: Epochs
 ) -> EmissionClock | None:
     """Return the clock of the arrivals of a file; None if they are no times, or if no clock is common to an epoch.
 
@@ -58,8 +60,8 @@ def emission_clock(
         Epoch and global number of the rows of each chunk.
     biases : sequence of Bias
         Biases of the problem. A scale of arrivals changes their clock, so the result is None.
-    count : int
-        Number of epochs k.
+    epochs : Epochs
+        The k epochs of the file.
     """
     arrivals = [
         (c, i, n) for c, i, n in zip(chunks, index, numbers, strict=True) if c.kind in ("toa", S_TOA) and len(i)
@@ -72,7 +74,7 @@ def emission_clock(
         return None
     if len({chunk.after for chunk, _, _ in arrivals}) > 1:
         return None
-    speed, begin = np.full(count, np.nan), np.zeros(count)
+    speed, begin = np.full(epochs.count, np.nan), np.zeros(epochs.count)
     for chunk, epoch, _ in arrivals:
         # Arrivals of S waves alone are divided by vp / vs, and so is their emission time.
         share = 1.0 if chunk.combination is None else chunk.combination.rows.factor[:, 0]
@@ -82,4 +84,5 @@ def emission_clock(
         speed[epoch] = own
         if chunk.after is not None and chunk.time is not None:
             begin[epoch] = chunk.time
-    return EmissionClock(speed, begin, arrivals[0][0].after == "date")
+    after = arrivals[0][0].after
+    return EmissionClock(speed, begin, after == "date" or (after == "time" and epochs.dated))

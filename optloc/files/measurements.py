@@ -15,13 +15,15 @@ import numpy as np
 from optloc.base.arrays import first_rows
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
+from optloc.base.time_scales import TimeScale
 from optloc.base.types import Array, Stations
 from optloc.base.units import LARGEST, UNITS, Conversion
 from optloc.files.declination import declination_of, declinations
+from optloc.files.row_epochs import Epochs
 from optloc.files.schema import MeasurementsTable, kind_model
 from optloc.files.settings import Units, join
 from optloc.files.stations import numbers_of
-from optloc.files.table import Epochs, Table
+from optloc.files.table import Table
 from optloc.files.words import distinct, numbered
 from optloc.models import Model
 from optloc.problem.phases import Combination
@@ -86,6 +88,8 @@ class RowChunk:
         Whether a column of the table replaces the stated sigma of the section.
     after : "time" or "date", optional
         For arrivals: z is seconds after the column time, or after the date that it contains.
+    dated : bool
+        Whether the column time has dates.
     """
 
     kind: str
@@ -116,6 +120,7 @@ class RowChunk:
     combination: Combination | None = None
     sigma_replaced: bool = False
     after: str | None = None
+    dated: bool = False
 
     @property
     def depends_on_speed(self) -> bool:
@@ -129,7 +134,7 @@ class Context:
     """Settings of a section and its rows.
 
     section: settings. table: rows. stations: names of all stations. where: place for messages. speed: propagation
-    speed, m/s. values: whether measured values are needed; otherwise a missing column z is NaN.
+    speed, m/s. values: whether measured values are needed; otherwise a missing column z is NaN. scale: scale of times.
     """
 
     section: MeasurementsTable
@@ -138,29 +143,23 @@ class Context:
     where: str
     speed: float
     values: bool
+    scale: TimeScale = "none"
 
 
-def chunks_of(
-    section: MeasurementsTable, table: Table, stations: tuple[str, ...], where: str, speed: float, *, values: bool
-) -> list[RowChunk]:
-    """Return the rows of one ``[[measurements]]`` table, one chunk for each of its kinds.
-
-    `stations` are the names of the stations, `where` is the place for messages, `speed` is the propagation speed, m/s.
-    With `values` False, a missing column z is NaN.
-    """
+def chunks_of(context: Context) -> list[RowChunk]:
+    """Return the rows of one ``[[measurements]]`` table, one chunk for each of its kinds."""
+    section, table, where = context.section, context.table, context.where
 
     def chunk(kind: str, pick: Array) -> RowChunk:
         """Return the rows `pick` of the table, which have the same kind, in SI units."""
-        part_of_table = table if len(pick) == table.count else table.take(pick)
-        part = Context(section, part_of_table, stations, where, speed, values)
-        return replace(_chunk(part, kind), row=pick, table=table)
+        part = table if len(pick) == table.count else table.take(pick)
+        return replace(_chunk(replace(context, table=part), kind), row=pick, table=table)
 
     if section.kind is not None:
         return [chunk(section.kind, np.arange(table.count))]
     if not table.has("kind"):
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "tdoa", or give the rows a column kind')
-    labels = table.labels("kind")
-    kinds, first, index = distinct(labels)
+    kinds, first, index = distinct(table.labels("kind"))
     made = []
     # Sort kinds by their first rows, so that a covariance across kinds keeps the order of the file.
     for i in np.argsort(first).tolist():
@@ -199,12 +198,12 @@ def _chunk(c: Context, kind: str) -> RowChunk:
         units.name(name), np.broadcast_to(unit.slope(z), z.shape), np.broadcast_to(0.0, z.shape),
         sigma, arrival, covariance, signal_of(c),
         table.labels("epoch") if table.has("epoch") else None,
-        table.times("time", seconds) if table.has("time") else None,
+        table.times("time", seconds, c.scale) if table.has("time") else None,
         table.labels("time") if table.has("time") and not table.has("epoch") else None,
         table.labels("target") if table.has("target") else None,
         section.excess and _is_range_sum(model), table, day, vp_vs=section.vp_vs,
         sigma_replaced=table.has("sigma") and section.sigma is not None,
-        after=section.after if kind == "toa" else None,
+        after=section.after if kind == "toa" else None, dated=table.has("time") and table.has_dates("time"),
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import Budget, access, check_budget, has_controls, json_of, read_text
+from optloc.base.time_scales import tai_minus_utc
 from optloc.base.types import Array, Stations
 from optloc.files.table import csv, of_frame
 
@@ -427,7 +428,7 @@ def _interpolate(
     clock of the file minus TAI, s; None for UTC. Raise InvalidProblem for times outside the file, or positions that are
     too far apart in time.
     """
-    at = seconds + (0.0 if ahead is None else ahead + _leap_seconds(seconds))
+    at = seconds + (0.0 if ahead is None else ahead + tai_minus_utc(seconds))
     where = f"{source}, satellite {name}"
     if len(nodes) < _POINTS:
         raise InvalidProblem(f"there are {len(nodes)} positions", where, f"interpolation needs {_POINTS}")
@@ -467,9 +468,3 @@ def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) 
         position[mine], velocity[mine] = through.derivatives((at[mine] - times_of_points[0]) / step, 2)
         velocity[mine] /= step  # from metres per step to metres per second
     return position, velocity
-
-
-def _leap_seconds(seconds: Array) -> Array:
-    """Return TAI minus UTC (k,), s, at times `seconds` (k,) since 1970, UTC."""
-    ahead = np.concatenate([_instants(part).tai for part in np.split(seconds, range(_AT_ONCE, len(seconds), _AT_ONCE))])
-    return np.asarray(np.round((ahead - (seconds / _DAY + _EPOCH_1970)) * _DAY))

@@ -18,6 +18,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, check_budget
+from optloc.base.time_scales import TimeScale
 from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.base.units import UNITS
 from optloc.files.constraint_reader import (
@@ -33,6 +34,7 @@ from optloc.files.emission_clock import EmissionClock, emission_clock
 from optloc.files.excess_paths import with_station_distance
 from optloc.files.measurements import (
     ESTIMATE,
+    Context,
     RowChunk,
     check_repeats,
     chunks_of,
@@ -44,10 +46,11 @@ from optloc.files.phase_rows import check_layers, combined_noise, split_phases, 
 from optloc.files.physics import warnings_of
 from optloc.files.propagation import check_speed, medium_in, speed_bias, speed_of, speed_words
 from optloc.files.roles import ASSUMED, azimuths_of, with_standard_names
+from optloc.files.row_epochs import Epochs, Keys, epochs_of, need_clock
 from optloc.files.schema import ProblemFile, StationsTable, name_of, read_document
 from optloc.files.settings import Units, join
 from optloc.files.stations import over_epochs, survey
-from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
+from optloc.files.table import Table, table_of
 from optloc.files.unknowns import (
     FREE,
     bias_of,
@@ -105,6 +108,8 @@ class Loaded:
         Wave speed, as text; empty if no value depends on it.
     emission : EmissionClock, optional
         Clock of the arrivals, for emission times; None without arrivals that are times.
+    dated : bool
+        Whether `times` are seconds since 1970, UTC.
     floors : tuple of float
         Heights, metres, on one of which the target is; empty without such a list.
     """
@@ -124,6 +129,7 @@ class Loaded:
     speed: str = ""
     floors: tuple[float, ...] = ()
     emission: EmissionClock | None = None
+    dated: bool = False
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the display unit of an unknown and its size in SI units: from the file, else `unit`."""
@@ -291,7 +297,7 @@ def assemble(
     chunks = []
     for i, (section, table) in enumerate(zip(file.measurements, tables, strict=True)):
         place = join(source, f"[[measurements]] {i + 1}")
-        chunks += chunks_of(section, table, found.names, place, speed, values=values)
+        chunks += chunks_of(Context(section, table, found.names, place, speed, values, _scale(file)))
     # Epochs come from the rows of all tables together: one instant may have rows of several kinds.
     epochs = _epochs(file, chunks, source)
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
@@ -323,10 +329,10 @@ def assemble(
     named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
     words = speed_words(file, source) if any(chunk.depends_on_speed for chunk in chunks) else ""
     floors = floors_of(demands, problem.motions)
-    clock = emission_clock(chunks, index, numbers, all_biases, len(epochs.labels))
+    clock = emission_clock(chunks, index, numbers, all_biases, epochs)
     loaded = Loaded(
         problem, source, file.title or source, *named, levels, units, azimuths, speed=words, floors=floors,
-        emission=clock,
+        emission=clock, dated=epochs.dated,
     )  # fmt: skip
     moving = found.moving or _has_moving_target(problem)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), moving)
@@ -355,7 +361,8 @@ def _problem(
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
     limits, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
-    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, **divided(limits))
+    dated = epochs.dated and times is epochs.times
+    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, dated=dated, **divided(limits))
     check_budget("unknowns", made.layout.n_shared, source)
     return _check(made, source, medium_in(file, source, frame, stations))
 
@@ -383,7 +390,24 @@ def _epochs(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> Epoch
     motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
     free = None if not motion else motion <= FREE
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
-    return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
+    found = epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
+    return replace(found, scale=_scale(file), dated=_is_dated(file, chunks, source))
+
+
+def _scale(file: ProblemFile) -> TimeScale:
+    """Return the scale of numbers in the columns of times of a file."""
+    return file.epochs.time_scale or "none"
+
+
+def _is_dated(file: ProblemFile, chunks: Sequence[RowChunk], source: str) -> bool:
+    """Return whether the times of a file are seconds since 1970, UTC; raise InvalidProblem for a scale of dates."""
+    timed = [chunk for chunk in chunks if chunk.time is not None]
+    dates, scale = any(chunk.dated for chunk in timed), _scale(file)
+    if scale in ("gps", "tai") and timed and all(chunk.dated for chunk in timed):
+        what = f"the measurements have dates, which are UTC, but the time scale is {scale}"
+        advice = "convert the dates to UTC and remove the key, or give seconds"
+        raise InvalidProblem(what, join(source, "[epochs]", "key 'time_scale'"), advice)
+    return bool(timed) and (dates or scale != "none")
 
 
 def _stations_used(chunk: RowChunk, epoch: Array) -> Array:

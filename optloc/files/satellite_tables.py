@@ -12,7 +12,7 @@ from optloc.base.frames import ECEF
 from optloc.base.inputs import check_budget
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.cell_text import column_times
+from optloc.files.cell_text import column_times, date_texts, is_dated
 from optloc.files.columns import PLACE, unit_of
 from optloc.files.csv_formats import read_table
 from optloc.files.orbits import read_orbits
@@ -20,7 +20,7 @@ from optloc.files.pseudoranges import at_reception, received
 from optloc.files.reading_report import unused_columns
 from optloc.files.roles import ColumnPlaces, Roles, check_column_hints, places_of, scaled
 from optloc.files.settings import Units
-from optloc.files.shapes import sigma_column, sigma_of
+from optloc.files.shapes import epoch_lines, sigma_column, sigma_of
 from optloc.files.table_import import ColumnHints, sort_named
 from optloc.files.table_problem import Converted, Section, TableProblem, no_sigma
 from optloc.files.words import distinct
@@ -59,8 +59,10 @@ def pseudoranges(source: Path, roles: Roles, hints: ColumnHints) -> TableProblem
     columns = {"epoch": epoch, "a": satellite, "z": z}  # each satellite is a station
     when = roles.find("time")
     if when is not None:
-        seconds = column_times(roles, when, hints.zone, hints.time_unit)
-        columns["time"] = roles.numbers("time") if seconds is None else seconds
+        seconds = column_times(roles, when, hints.zone, hints.time_unit, hints.time_scale)
+        known = roles.numbers("time") if seconds is None else seconds
+        columns["time"] = date_texts(known) if is_dated(roles.table, when) else known
+    after = epoch_lines(hints, columns, roles.table.source)
     uses = {roles.column(role): role for role in ("satellite", "toa", *"xyz")}
     uses |= dict.fromkeys(roles.column(by).split("+"), by) | ({} if when is None else {when: "time"})
     if sigma_of_rows is not None:
@@ -78,7 +80,7 @@ def pseudoranges(source: Path, roles: Roles, hints: ColumnHints) -> TableProblem
     read += [("sigma", f"of pseudoranges, from column {sigma_of_rows}")] if "sigma" in columns else []
     read += [("not used", ", ".join(rest))] if rest else []
     places = ColumnPlaces(satellites, "ecef", length)
-    return TableProblem(source, (section,), places, tuple(read), notes, AT_RECEPTION, uses=uses)
+    return TableProblem(source, (section,), places, tuple(read), notes, AT_RECEPTION, after, uses=uses)
 
 
 def gnss(source: Path, hints: ColumnHints) -> TableProblem:
@@ -91,7 +93,9 @@ def gnss(source: Path, hints: ColumnHints) -> TableProblem:
     columns["sigma"] = np.round(found.sigma, 3)
     places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
     section = Section("toa", columns, "m", None, "the range and the receiver's clock")
-    return TableProblem(source, (section,), ColumnPlaces(places, "ecef", "m"), found.about, found.notes, AT_RECEPTION)
+    after = ("", "[epochs]", 'time_scale = "gps"')
+    stations = ColumnPlaces(places, "ecef", "m")
+    return TableProblem(source, (section,), stations, found.about, found.notes, AT_RECEPTION, after)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:

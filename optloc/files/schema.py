@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
+from optloc.base.time_scales import TimeScale
 from optloc.base.types import (
     Amount,  # of a table: bare numbers are in its unit
     FormName,
@@ -300,10 +301,13 @@ class MediumTable(FileTable):
 
 
 class WindowTable(FileTable):
-    """Assignment of rows to epochs by their times."""
+    """Times of the rows, and their assignment to epochs."""
 
     window: str | None = None
     """Length of an epoch, such as "0.1 s"; by default, rows of exactly equal time form an epoch."""
+    time_scale: TimeScale | None = None
+    """Scale of numbers in columns of times: "unix" or "utc" (since 1970, UTC), "gps" (since 6 January 1980) or "tai"
+    (since 1970). Results then have dates in UTC. By default "none": seconds that are no dates."""
 
 
 class ProblemFile(FileTable):

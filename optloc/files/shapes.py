@@ -7,6 +7,7 @@ number of rows of the table.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.time_scales import TIME_SCALES
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cell_text import Decimals, NumberColumn, column_times, date_seconds, date_texts, is_dated, numbers
@@ -421,7 +423,7 @@ def events_of_rows(roles: Roles, hints: ColumnHints) -> dict[str, Array]:
     if roles.find("message") is not None:
         out["epoch"] = roles.labels("message")
     name = roles.find("time")
-    time = None if name is None else column_times(roles, name, hints.zone, hints.time_unit)
+    time = None if name is None else column_times(roles, name, hints.zone, hints.time_unit, hints.time_scale)
     if time is not None:
         out["time"] = time
     elif name is not None and "epoch" not in out:
@@ -462,7 +464,7 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
         raise _no_times()
     if message is not None and hints.window is None:
         out["epoch"] = roles.labels("message")
-    time = None if when is None else column_times(roles, when, hints.zone, hints.time_unit)
+    time = None if when is None else column_times(roles, when, hints.zone, hints.time_unit, hints.time_scale)
     if time is not None:
         # Dates stay dates, so that labels of epochs and written files show them.
         out["time"] = date_texts(time) if is_dated(table, str(when)) else time
@@ -475,6 +477,26 @@ def epochs_of(roles: Roles, hints: ColumnHints, found: Sequence[Readings]) -> di
     if not long and not out.keys() & {"epoch", "time"}:
         out["epoch"] = _row_numbers(table)
     return out
+
+
+def epoch_lines(hints: ColumnHints, epochs: Mapping[str, Array], source: str) -> tuple[str, ...]:
+    """Return the lines of a problem file on its times: the window of an epoch and the time scale.
+
+    `epochs` are the columns that determine epochs, and `source` is the place for messages.
+    """
+    # With a column "epoch", the window was already used to make its labels.
+    lines = [f"window = {json.dumps(hints.window)}"] if hints.window is not None and "epoch" not in epochs else []
+    if hints.time_scale is not None:
+        if hints.time_scale not in TIME_SCALES:
+            what = f"{hints.time_scale!r} is not a time scale"
+            raise InvalidProblem(what, "--time-scale", nearest(hints.time_scale, list(TIME_SCALES)))
+        if "time" not in epochs:
+            raise InvalidProblem(f"{source} has no column of times", "--time-scale", "state it with --column time=NAME")
+        if epochs["time"].dtype.kind == "O":
+            what = f"the times of {source} are dates, which have the scale utc"
+            raise InvalidProblem(what, "--time-scale", "remove it, or convert the dates to UTC")
+        lines.append(f"time_scale = {json.dumps(hints.time_scale)}")
+    return ("", "[epochs]", *lines) if lines else ()
 
 
 def _no_times() -> InvalidProblem:

@@ -17,9 +17,10 @@ from optloc.base.inputs import check_budget
 from optloc.base.types import Array, Stations
 from optloc.files.columns import stem
 from optloc.files.roles import WORDS, with_standard_columns
+from optloc.files.row_epochs import Epochs
 from optloc.files.schema import FrameTable, StationsTable
 from optloc.files.settings import Units, join
-from optloc.files.table import Epochs, Table, of_frame
+from optloc.files.table import Table, of_frame
 from optloc.files.words import distinct
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
@@ -385,7 +386,7 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
     Positions are interpolated between the two rows. The rows are -1 outside the times of a station.
     """
     unit = Units("time").conversion(section.time_unit, found.table.source)
-    times, k = found.table.times("time", unit.factor), epochs.count
+    times, k = found.table.times("time", unit.factor, epochs.scale), epochs.count
     if not np.isfinite(epochs.times).all():
         advice = "give the measurements a column 'time', or the stations a column 'epoch'"
         raise InvalidProblem(

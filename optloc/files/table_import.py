@@ -109,6 +109,8 @@ class ColumnHints:
         Columns to leave out, such as unwanted measurements.
     time_unit : str, optional
         Unit of the time column, if its name does not end in the unit.
+    time_scale : str, optional
+        Scale of numbers in the time column, as in a problem file: "unix", "utc", "gps", "tai" or "none".
     unit : str, optional
         Unit of the values, if the column name does not end in the unit.
     frame : "cartesian" or "ecef", optional
@@ -156,6 +158,7 @@ class ColumnHints:
     columns: Mapping[str, str] = field(default_factory=dict)
     ignore: tuple[str, ...] = ()
     time_unit: str | None = None
+    time_scale: str | None = None
     unit: str | None = None
     frame: str | None = None
     times: Path | None = None

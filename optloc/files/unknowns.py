@@ -14,12 +14,14 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
+from optloc.base.time_scales import unix_seconds
 from optloc.base.types import Array, Bias, Motion, Prior, Rows
 from optloc.base.units import Conversion, Quantity
+from optloc.files.row_epochs import Epochs
 from optloc.files.schema import BiasTable, FrameTable, Origin, PriorTable, ProblemFile, StationsTable, TargetTable
 from optloc.files.settings import Units, join
 from optloc.files.stations import stations_over_epochs, survey
-from optloc.files.table import Epochs, Table, table_of
+from optloc.files.table import Table, table_of
 from optloc.problem.bias import family
 from optloc.problem.clocks import clock_densities
 from optloc.problem.forms import FORMS, BiasForm, complete, form_of
@@ -49,18 +51,21 @@ def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], so
             join(source, "[targets]"),
             nearest(unknown[0], sorted(set(epochs.targets))),
         )
-    return tuple(_motion(file.targets.get(name, file.target), epochs.count, known.get(name)) for name in names)
+    return tuple(_motion(file.targets.get(name, file.target), epochs, known.get(name)) for name in names)
 
 
-def _motion(table: TargetTable, count: int, known: Array | None) -> Motion:
+def _motion(table: TargetTable, epochs: Epochs, known: Array | None) -> Motion:
     """Return the motion of a target; by default static for one epoch, else a free position at each epoch.
 
-    `count` is the number of epochs. `known` (k or 1, order + 1, d) are the states of a known target, or None.
+    `known` (k or 1, order + 1, d) are the states of a known target, or None.
     """
+    count, reference = epochs.count, table.reference
     if known is not None:
         return Motion(known.shape[-2] - 1, "epoch" if count > 1 else "run", known)
     motion = table.motion or ("static" if count == 1 else "free")
-    return Motion(_ORDERS[motion], "epoch" if motion in FREE and count > 1 else "run", reference=table.reference)
+    if reference is not None:
+        reference = float(unix_seconds(np.asarray(reference), epochs.scale))
+    return Motion(_ORDERS[motion], "epoch" if motion in FREE and count > 1 else "run", reference=reference)
 
 
 def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str | None:
@@ -178,7 +183,10 @@ def bias_of(
         if np.isin(bias.row, numbers).any()
     }
     # the constructor of the problem rejects epochs without times
-    bias = complete(bias, epochs.clock, where, **_walk_parameters(table, [units for units, _ in spelled], where))
+    changes = _walk_parameters(table, [units for units, _ in spelled], where)
+    if isinstance(table.knots, list):
+        changes["knots"] = unix_seconds(np.array(table.knots), epochs.scale).tolist()
+    bias = complete(bias, epochs.clock, where, **changes)
     form = form_of(bias)
     mean, sigma = _prior(table, form, [units for units, _ in spelled], form.shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(form, spelled, where)

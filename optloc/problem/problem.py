@@ -75,6 +75,8 @@ class Problem(HasShortForm):
         Uncertain half-planes, which are terms of the cost.
     written : Written, optional
         Units of the file; None for a problem without a file. They change no number.
+    dated : bool
+        Whether the times are seconds since 1970, UTC, so that pictures show them as dates.
     """
 
     stations: Stations
@@ -89,6 +91,7 @@ class Problem(HasShortForm):
     medium: Medium | None = None
     fences: tuple[Fence, ...] = ()
     written: Written | None = field(default=None, compare=False)
+    dated: bool = False
 
     def __post_init__(self) -> None:
         """Move fences from the constraints to `fences`: users state both in one list."""

@@ -14,6 +14,8 @@ from optloc.show import FORMATS as FILE_FORMATS, Mark, Other, earth_points, elli
 
 # Metres of a foot.
 _FEET = 0.3048
+# Times of a stream from this value on, s, are since 1970, UTC: it is the year 2000. Smaller times are seconds of a run.
+_FIRST_DATE = 946_684_800.0
 # Seconds after which a target is removed from the list; maps of aircraft use this limit.
 _MAX_AGE = 60.0
 # Positions of a trail: two minutes of one fix a second, few enough for a feed that is read once a second.
@@ -88,7 +90,8 @@ def to_mark(record: Record, frame: Frame) -> Mark:
         velocity=np.array(record["velocity"], dtype=float) if record.get("velocity") else None,
         name=name,
         target=name,
-        time=float(record.get("time", np.nan)),
+        time=(when := float(record.get("time", np.nan))),
+        dated=when >= _FIRST_DATE,
         sentence=record.get("sentence", ""),
         texts=texts,
         others=tuple(others),

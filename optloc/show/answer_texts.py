@@ -90,7 +90,7 @@ def length_text(value: float, sigma: float = np.nan) -> str:
 def level_sigmas(columns: Columns, i: int) -> list[float]:
     """Return the standard deviations, m, of row `i` along east, north and up; NaN if unknown, 0 for rounding error."""
     variances = [float(columns[f"cov_{2 * axis}"][i]) if f"cov_{2 * axis}" in columns else np.nan for axis in "enu"]
-    return np.sqrt(np.maximum(variances, 0.0)).tolist()
+    return [float(v) for v in np.sqrt(np.maximum(variances, 0.0))]
 
 
 def rounded(value: float, digits: int) -> str:

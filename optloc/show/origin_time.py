@@ -9,10 +9,6 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.show.columns import Columns
 
-FIRST_DATE = 946_684_800.0
-"""Times from this value on, s, count from 1970, UTC: it is the year 2000. Smaller times count from the start of a run,
-of a day or of a week, or are seconds of GPS time before 2010."""
-
 # Numbers that a date of Python can hold, seconds since 1970: the years 1 to 9999.
 _FIRST, _LAST = -62_135_596_800.0, 253_402_300_799.0
 

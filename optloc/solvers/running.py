@@ -188,6 +188,8 @@ class GrowingRun:
         Their covariance; NaN likewise.
     layout : Layout
         Names and units of the entries.
+    dated : bool
+        Whether the times are since 1970, UTC.
     """
 
     counts: Array
@@ -195,6 +197,7 @@ class GrowingRun:
     x: Array
     cov: Array
     layout: Layout
+    dated: bool = False
 
     def take(self, name: str) -> tuple[Array, Array]:
         """Return estimates and standard deviations, both (q, size), of a named unknown, in its unit."""
@@ -238,7 +241,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
         spread, ok = covariance(done.equations)
         if ok[0] and done.status[0] == Status.OK:
             x[i], cov[i] = done.x[0, :n], spread[0]
-    return GrowingRun(chosen, problem.times[chosen - 1], x, cov, problem.layout)
+    return GrowingRun(chosen, problem.times[chosen - 1], x, cov, problem.layout, problem.dated)
 
 
 def _space_counts(epochs: int) -> Array:

@@ -204,6 +204,7 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
         none,
         np.where(good, code, int(Status.TOO_FEW_ROWS)).astype(np.int8),
         d,
+        problem.dated,
     )
 
 
@@ -441,4 +442,5 @@ def _bistatic_track(problem: Problem, steps: list[tuple[Array, Array, Array, Arr
         none,
         code.reshape(*batch, k).astype(np.int8),
         3,
+        problem.dated,
     )

@@ -94,7 +94,7 @@ def track(
     dynamics = motion_named(model) if isinstance(model, str) else model
     run = differences(problem) if problem.emitting else problem
     entries = list(tracked(run, dynamics, update, start=start, rules=rules))
-    return collected(entries, problem.dimension)
+    return replace(collected(entries, problem.dimension), dated=problem.dated)
 
 
 def tracked(

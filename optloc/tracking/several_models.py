@@ -183,7 +183,8 @@ def imm(
         steps.append(_combine(done, weight, total))
         times.append(time)
         weights.append(weight)
-    return Mixed(tuple(models), collect(np.array(times), steps, d), np.stack(weights, axis=-2))
+    track = collect(np.array(times), steps, d, dated=problem.dated)
+    return Mixed(tuple(models), track, np.stack(weights, axis=-2))
 
 
 def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[list[State], Array]:

@@ -104,7 +104,7 @@ def associated(
         steps.append((done, code))
         times.append(time)
         picks.append(pick)
-    return Associated(collect(np.array(times), steps, d), tuple(picks))
+    return Associated(collect(np.array(times), steps, d, dated=given.channels.dated), tuple(picks))
 
 
 # Unlabelled measurements: the candidate values of each channel of each scan.

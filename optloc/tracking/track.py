@@ -77,6 +77,8 @@ class Track(HasShortForm):
         the gate or are not finite. Numerical: the update failed, the state is only predicted.
     dimension : int
         2 or 3.
+    dated : bool
+        Whether the times are since 1970, UTC.
     """
 
     times: Array
@@ -87,6 +89,7 @@ class Track(HasShortForm):
     loglikelihood: Array
     code: Array
     dimension: int
+    dated: bool = False
 
     @property
     def position(self) -> Array:
@@ -162,7 +165,7 @@ def follow(problem: Problem, start: State, dynamics: Dynamics, rule: Update) -> 
         state = State(time, done.mean, done.cov)
         steps.append((done, code))
         times.append(time)
-    return collect(np.array(times), steps, problem.dimension)
+    return collect(np.array(times), steps, problem.dimension, dated=problem.dated)
 
 
 def step(
@@ -305,10 +308,11 @@ def _prediction_only(ahead: State) -> Updated:
     return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
 
 
-def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
+def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int, *, dated: bool = False) -> Track:
     """Return the updates and statuses of all scans as a track.
 
-    `steps` are the update and status of each scan, in the order of the `times` (k,), s. `dimension` is 2 or 3.
+    `steps` are the update and status of each scan, in the order of the `times` (k,), s, which are since 1970,
+    UTC, if `dated`. `dimension` is 2 or 3.
     """
     if not steps:
         raise InvalidProblem("no scan is later than the start", "start", "give a start before the last scan")
@@ -326,6 +330,7 @@ def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) ->
         stacked("loglikelihood", 0),
         np.stack([code for _, code in steps], axis=-1),
         dimension,
+        dated,
     )
 
 

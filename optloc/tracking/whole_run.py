@@ -109,7 +109,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
         found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
         code = np.where(white.count > 0, status, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
-    return collect(np.asarray(problem.times), steps, problem.dimension)
+    return collect(np.asarray(problem.times), steps, problem.dimension, dated=problem.dated)
 
 
 def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dynamics) -> Array:

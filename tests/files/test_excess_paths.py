@@ -5,7 +5,7 @@ import pytest
 
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.excess_paths import with_baseline, with_station_distance
-from optloc.files.measurements import chunks_of
+from optloc.files.measurements import Context, chunks_of
 from optloc.files.schema import MeasurementsTable
 from optloc.files.table import of_rows
 from optloc.problem.build import station_array
@@ -21,7 +21,7 @@ def chunk(excess):
     """Return the chunk of two path sums, the second absent."""
     section = MeasurementsTable(kind="range_sum", excess=excess)
     table = of_rows(ROWS, "rows", {})
-    (one,) = chunks_of(section, table, ("A", "B", "C"), "rows", SPEED_OF_LIGHT, values=True)
+    (one,) = chunks_of(Context(section, table, ("A", "B", "C"), "rows", SPEED_OF_LIGHT, True))
     return one
 
 

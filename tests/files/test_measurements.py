@@ -5,7 +5,7 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.files.measurements import chunks_of, square
+from optloc.files.measurements import Context, chunks_of, square
 from optloc.files.schema import MeasurementsTable
 from optloc.files.table import of_rows
 
@@ -14,7 +14,7 @@ STATIONS = ("A", "B", "C")
 
 def chunks(rows, speed=SPEED_OF_LIGHT, **section):
     table = of_rows(rows, "rows", {})
-    return chunks_of(MeasurementsTable(**section), table, STATIONS, "rows", speed, values=True)
+    return chunks_of(Context(MeasurementsTable(**section), table, STATIONS, "rows", speed, True))
 
 
 def test_nanoseconds_become_metres_and_a_turned_sign_turns_the_stations():

@@ -198,6 +198,44 @@ def test_epochs_by_window_and_by_time(tmp_path):
     np.testing.assert_array_equal(from_table(dates, STATIONS, kind="tdoa", sigma=1.0).epoch, [1, 0, 1, 0, 2])
 
 
+TIMED = """format = 2
+[stations]
+rows = [{ name = "A", x = 0.0, y = 0.0 }, { name = "B", x = 100.0, y = 0.0 }, { name = "C", x = 0.0, y = 100.0 }]
+[[measurements]]
+kind = "range"
+sigma = 1.0
+columns = { time = "t" }
+rows = [
+  { t = %s, a = "A", z = 50.0 }, { t = %s, a = "B", z = 70.0 }, { t = %s, a = "C", z = 80.0 },
+]
+[target]
+motion = "constant_velocity"
+reference = 1400000000.0
+"""
+
+
+@pytest.mark.parametrize(("scale", "first"), [("gps", 1_715_964_782.0), ("tai", 1_399_999_965.0), ("unix", 1.4e9)])
+def test_times_of_a_scale_are_since_1970(scale, first, tmp_path):
+    text = TIMED % (1.4e9, 1.4e9, 1.4e9) + f'[epochs]\ntime_scale = "{scale}"\n'
+    found = read(write(tmp_path, text))
+    assert (found.dated, found.problem.dated, found.times.tolist()) == (True, True, [first])
+    assert found.problem.motions[0].reference == first
+    assert found.epochs == ("1400000000",)
+
+
+@pytest.mark.parametrize("scale", ["", '[epochs]\ntime_scale = "none"\n'])
+def test_seconds_without_a_scale_are_no_dates(scale, tmp_path):
+    found = read(write(tmp_path, TIMED % (1.4e9, 1.4e9, 1.4e9) + scale))
+    assert (found.dated, found.problem.dated, found.times.tolist()) == (False, False, [1.4e9])
+
+
+def test_dates_have_no_other_scale(tmp_path):
+    text = TIMED % (('"2024-05-17T16:53:02Z"',) * 3)
+    assert read(write(tmp_path, text)).dated
+    with pytest.raises(InvalidProblem, match="the measurements have dates, which are UTC, but the time scale is gps"):
+        read(write(tmp_path, text + '[epochs]\ntime_scale = "gps"\n'))
+
+
 def test_free_targets_have_epochs_of_their_own():
     rows = {
         "time": [0.0, 0.0, 1.0, 1.0],

@@ -5,9 +5,10 @@ import pytest
 
 from optloc import InvalidProblem
 from optloc.base.frames import ECEF
+from optloc.files.row_epochs import Epochs
 from optloc.files.schema import FrameTable, StationsTable
 from optloc.files.stations import over_epochs, survey
-from optloc.files.table import Epochs, of_rows
+from optloc.files.table import of_rows
 
 
 def surveyed(rows, frame=None, **section):

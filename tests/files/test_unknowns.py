@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion
+from optloc.files.row_epochs import Epochs
 from optloc.files.schema import PriorTable, validate
-from optloc.files.table import Epochs
 from optloc.files.unknowns import motions_of, needs_clock, prior_of
 
 REST = {"format": 2, "stations": {"file": "s.csv"}, "measurements": [{"kind": "range", "file": "r.csv"}]}

@@ -43,6 +43,8 @@ class Format:
         Whether the format needs positions on Earth.
     each : callable of Mark, optional
         Returns the text of one mark, for streams; empty if the format omits the mark.
+    dated : bool
+        Whether the file has the dates of fixes, if they are known.
     """
 
     endings: tuple[str, ...]
@@ -52,6 +54,7 @@ class Format:
     write: Callable[[Path, Results], None]
     earth: bool = False
     each: Callable[[Mark], str] | None = None
+    dated: bool = False
 
 
 def _text_writer(of: Callable[[Results], str]) -> Callable[[Path, Results], None]:
@@ -115,6 +118,7 @@ FORMATS = {
         "point in another colour, its status in its name, no ellipse; alternatives as points",
         _text_writer(kml),
         earth=True,
+        dated=True,
     ),
     "gpx": Format(
         (".gpx",),
@@ -123,6 +127,7 @@ FORMATS = {
         "waypoint with its status in its name; alternatives as waypoints; a gap in a track",
         _text_writer(gpx),
         earth=True,
+        dated=True,
     ),
     "cot": Format(
         (".cot",),

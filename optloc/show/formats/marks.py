@@ -23,7 +23,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.show.columns import Columns, level_covariance, records
 from optloc.show.knowledge import known_features
-from optloc.show.origin_time import FIRST_DATE, iso_of
+from optloc.show.origin_time import iso_of
 from optloc.show.render import line_of_answer
 from optloc.show.row_answer import RowSource, state_table
 from optloc.tracking.entry import scan_sentence
@@ -97,6 +97,8 @@ class Mark:
         Row of the table of the mark, for its texts.
     others : tuple of Other
         Alternatives.
+    dated : bool
+        Whether the time is since 1970, UTC.
     """
 
     name: str
@@ -110,6 +112,7 @@ class Mark:
     velocity: Array | None
     row: RowSource
     others: tuple[Other, ...] = ()
+    dated: bool = False
 
     @property
     def known(self) -> bool:
@@ -128,9 +131,10 @@ class Mark:
 
     @property
     def date(self) -> datetime | None:
-        """Return the time as a date, UTC; None if the time does not count from 1970."""
+        """Return the time as a date, UTC; None if the time is unknown or does not count from 1970."""
         # A float of seconds since 1970 is accurate to less than a microsecond, the resolution of `timedelta`.
-        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.time) if self.time >= FIRST_DATE else None
+        known = self.dated and np.isfinite(self.time)
+        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=self.time) if known else None
 
     @property
     def words(self) -> str:
@@ -240,6 +244,8 @@ class Results:
         The problem of the fixes. It gives the stations, and it is needed for the 95 % regions.
     title : str
         Title inside the file.
+    dated : bool
+        Whether the column `time` is in seconds since 1970, UTC.
     """
 
     columns: Columns
@@ -247,6 +253,13 @@ class Results:
     fixes: Sequence[Fix] = ()
     problem: Problem | None = None
     title: str = "optloc"
+    dated: bool = False
+
+    @property
+    def undated(self) -> bool:
+        """Return whether the results have times that are no dates: seconds without a time scale."""
+        times = np.asarray(self.columns.get("time", np.zeros(0)), dtype=float)
+        return not self.dated and bool(np.isfinite(times).any())
 
     @property
     def course(self) -> bool:
@@ -335,13 +348,14 @@ class Results:
             time=float(number.get("time", np.nan)),
             others=others,
             row=source,
+            dated=self.dated,
         )
 
     def _name(self, row: dict[str, Any]) -> str:
         """Return the name of a row: target, label or number, and epoch, each only if the table has several."""
         own = "label" if "label" in row else "number"
         several = [n for n in ("target", own, "epoch") if n in row and len(set(self.columns[n].tolist())) > 1]
-        return " ".join(_label(row, name) for name in several) or str(row.get("target", "fix"))
+        return " ".join(_label(row, name, self.dated) for name in several) or str(row.get("target", "fix"))
 
     def _others(self) -> list[tuple[Other, ...]]:
         """Return the alternatives of each row; empty unless each row is one estimated position."""
@@ -409,10 +423,10 @@ class Results:
         return {i: each[0] for i, each in enumerate(found) if each}
 
 
-def _label(row: dict[str, Any], name: str) -> str:
+def _label(row: dict[str, Any], name: str, dated: bool) -> str:
     """Return the text of a column of a row; for an epoch without a label, whose text is its time, the date in UTC."""
     text, time = str(row[name]), row.get("time")
-    if name != "epoch" or time is None or time < FIRST_DATE or text != f"{time:.15g}":
+    if name != "epoch" or time is None or not dated or text != f"{time:.15g}":
         return text
     return iso_of(time, _SHOWN_TIME)
 

@@ -14,6 +14,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring  # only 
 
 import numpy as np
 
+from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import visible
 from optloc.base.types import Array
 from optloc.show.formats.marks import Area, Mark, Other, Results, ellipse
@@ -276,7 +277,13 @@ _STALE = 60.0
 
 
 def cot(results: Results) -> str:
-    """Return the events of Cursor on Target for all marks and alternatives, one event on each line."""
+    """Return the events of Cursor on Target for all marks and alternatives, one event on each line.
+
+    Events without a time start now. Raise InvalidProblem for times that are no dates.
+    """
+    if results.undated:
+        advice = 'state --time-scale for a table, or time_scale = "unix" under [epochs]'
+        raise InvalidProblem("Cursor on Target needs dates, but the times have no time scale", results.title, advice)
     return "\n".join(filter(None, map(event, results.marks())))
 
 

@@ -37,7 +37,7 @@ def live_mark(frame: Frame, mark: Mark, trail: Sequence[Array] = ()) -> dict[str
         without a valid covariance.
     """
     source = mark.row
-    row = map_row(frame, source.columns, source.number, mark.name, mark.time)
+    row = map_row(frame, source.columns, source.number, mark.name, mark.time, dated=mark.dated)
     texts = {name: getattr(row, name) for name in ("name", "time", "status", "look", "place", "copied", "size", "note")}
     axes = None
     if mark.covers:

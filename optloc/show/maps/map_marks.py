@@ -16,7 +16,6 @@ from optloc.problem.problem import Problem
 from optloc.show.answer_texts import latlon_texts, length_text, level_sigmas, place_rows, sigma_of, sure_rows
 from optloc.show.columns import Columns, fix_columns, join_tables
 from optloc.show.maps.canvas import MapRow
-from optloc.show.origin_time import FIRST_DATE
 from optloc.show.pictures.outlines import level_planes
 from optloc.show.pictures.scene import is_local, regions_of, states_of
 from optloc.show.row_answer import state_table, use_rows, why_rows
@@ -154,6 +153,8 @@ def fixed_spots(
     labels: Sequence[str] = (),
     times: Sequence[float] = (),
     targets: Sequence[str] = (),
+    *,
+    dated: bool = False,
 ) -> Spots:
     """Return the marks of fixes.
 
@@ -169,6 +170,8 @@ def fixed_spots(
         Times of the positions, s; ignored if their number is another.
     targets : sequence of str
         Targets of the positions, each of which has its trail; by default one target.
+    dated : bool
+        Whether the times are since 1970, UTC.
     """
     parts = [part for fix in fixes for part in states_of(fix)]
     position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -176,7 +179,7 @@ def fixed_spots(
     count = len(position)
     names = list(labels) if len(labels) == count else [""] * count
     when = list(times) if len(times) == count else [np.nan] * count
-    rows = tuple(map_row(problem.frame, columns, i, names[i], when[i]) for i in range(count))
+    rows = tuple(map_row(problem.frame, columns, i, names[i], when[i], dated=dated) for i in range(count))
     sentences = [row_text(row if count > 1 else replace(row, name="", time="")) for row in rows]
     outlines = regions_of(problem, fixes, count, [level_planes(problem, position)])
     for i, regions in enumerate(outlines):
@@ -191,7 +194,9 @@ def fixed_spots(
     return replace(found, local=local, rows=rows, groups=trail)
 
 
-def map_row(frame: Frame, columns: Columns, i: int, name: str = "", time: float = np.nan) -> MapRow:
+def map_row(
+    frame: Frame, columns: Columns, i: int, name: str = "", time: float = np.nan, *, dated: bool = False
+) -> MapRow:
     """Return the row of the list for row `i` of a table of fixes or scans, in the words of a printed fix.
 
     Parameters
@@ -206,11 +211,13 @@ def map_row(frame: Frame, columns: Columns, i: int, name: str = "", time: float 
         Name of the row.
     time : float
         Time, s; NaN if it is unknown.
+    dated : bool
+        Whether the time is since 1970, UTC.
     """
     status, noted = str(columns["status"][i]), use_rows(columns, i)[0][1].partition("; ")[2]
     note = "; ".join(part for part in (*(text for _, text in why_rows(columns, i)), noted) if part)
     unchecked = "unchecked" in columns and bool(columns["unchecked"][i])
-    row = MapRow(name, time_text(time), status, look_of(status, unchecked=unchecked), note=note)
+    row = MapRow(name, time_text(time, dated=dated), status, look_of(status, unchecked=unchecked), note=note)
     position = np.array([columns[axis][i] for axis in "xyz" if axis in columns], dtype=float)
     if not np.isfinite(position).all():
         return replace(row, place="", size="no position")
@@ -226,11 +233,11 @@ def map_row(frame: Frame, columns: Columns, i: int, name: str = "", time: float 
     return replace(row, place=place, copied=place, size="; ".join([*tall, *sizes]))
 
 
-def time_text(time: float) -> str:
-    """Return a time, s, as text: a date if it counts from 1970, else seconds; empty if it is NaN."""
+def time_text(time: float, *, dated: bool = False) -> str:
+    """Return a time, s, as text: a date if it is since 1970, UTC (`dated`), else seconds; empty if it is NaN."""
     if not np.isfinite(time):
         return ""
-    if time < FIRST_DATE:
+    if not dated:
         return f"{time:.10g} s"
     date = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=float(time))
     return date.isoformat(sep=" ", timespec="milliseconds").replace(".000+00:00", "+00:00").replace("+00:00", " UTC")
@@ -264,7 +271,7 @@ def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
     return replace(found, rows=rows)
 
 
-def scan_spots(problem: Problem, columns: Columns, names: Sequence[str], clean: Array) -> Spots:
+def scan_spots(problem: Problem, columns: Columns, names: Sequence[str], clean: Array, *, dated: bool = False) -> Spots:
     """Return the marks of the scans of tracks.
 
     Parameters
@@ -277,11 +284,14 @@ def scan_spots(problem: Problem, columns: Columns, names: Sequence[str], clean: 
         Name of each scan.
     clean : bool array (n,)
         Whether the status is ok.
+    dated : bool
+        Whether the times are since 1970, UTC.
     """
     axes = "xyz"[: problem.dimension]
     position = np.stack([columns[axis] for axis in axes], axis=-1)
     covariance = np.stack([np.stack([columns[f"cov_{min(a, b)}{max(a, b)}"] for b in axes], -1) for a in axes], -2)
-    rows = tuple(map_row(problem.frame, columns, i, name, columns["time"][i]) for i, name in enumerate(names))
+    times = columns["time"]
+    rows = tuple(map_row(problem.frame, columns, i, name, times[i], dated=dated) for i, name in enumerate(names))
     found = spots(problem, position, covariance, clean, [row_text(row) for row in rows])
     return replace(found, rows=rows, groups=tuple(columns["target"].tolist()))
 

@@ -51,6 +51,7 @@ def fix_page(
     *,
     times: Sequence[float] = (),
     targets: Sequence[str] = (),
+    dated: bool = False,
     answer: FixAnswer | None = None,
 ) -> str:
     """Return an HTML page with the answer as text and an interactive map; the page needs no server and no network.
@@ -71,6 +72,8 @@ def fix_page(
         Times of the fixes, s.
     targets : sequence of str
         Targets of the fixes, each of which has its trail; by default one target.
+    dated : bool
+        Whether the times are since 1970, UTC.
     answer : FixAnswer, optional
         Text above the map. By default, the answers of the fixes.
 
@@ -80,7 +83,7 @@ def fix_page(
         If nothing has a position, or matplotlib is missing.
     """
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
-    found, others = fixed_spots(problem, several, labels, times, targets), other_spots(problem, several)
+    found, others = fixed_spots(problem, several, labels, times, targets, dated=dated), other_spots(problem, several)
     # Lines of position need a single fix.
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
     shown = [_answer(fix, labels) for fix in several] if answer is None else [replace(answer, title="")]

@@ -149,7 +149,7 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     """
     word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
     sigma, entries = course.sigma(slot.name), slot.entries
-    scale = time_scale(course.times)
+    scale = time_scale(course.times, dated=course.dated)
     times = scale.values(course.times)
     if slot.members and slot.size > _MANY:
         # `total` is the root of the sum of squares of all members.
@@ -220,7 +220,7 @@ def plot_biases(
         values, sigma = found.take(slot.name)
         estimates = _Estimates(values / size, sigma / abs(size), unit, slot)
         true = None if truth is None or slot.name not in truth else np.ravel(truth[slot.name]) / size
-        _bias_panel(panel, found.times, estimates, true)
+        _bias_panel(panel, found.times, estimates, true, dated=found.dated)
     return finish(figure, title)
 
 
@@ -238,13 +238,14 @@ class _Estimates(NamedTuple):
     slot: Slot
 
 
-def _bias_panel(panel: Axes, times: Array, found: _Estimates, truth: Array | None) -> None:
+def _bias_panel(panel: Axes, times: Array, found: _Estimates, truth: Array | None, *, dated: bool) -> None:
     """Draw the estimates of one family against time with their 95 % intervals.
 
-    `times` (k,) are in s. If `truth` (p,) is given, in the unit of the panel, the true values are dotted lines.
+    `times` (k,) are in s; if `dated`, since 1970, UTC. If `truth` (p,) is given, in the unit of the panel,
+    the true values are dotted lines.
     """
     values, sigma, unit, slot = found
-    scale: TimeScale = time_scale(times)
+    scale: TimeScale = time_scale(times, dated=dated)
     shown = scale.values(times)
     for i, entry in enumerate(slot.entries[:_MOST]):
         colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]

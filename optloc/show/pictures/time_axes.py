@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.show.origin_time import FIRST_DATE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,11 +53,11 @@ class TimeScale:
             panel.xaxis.set_major_formatter(module.ConciseDateFormatter(locator))
 
 
-def time_scale(times: Array) -> TimeScale:
-    """Return the scale of an axis for times (k,), s; NaN times do not count."""
+def time_scale(times: Array, *, dated: bool = False) -> TimeScale:
+    """Return the scale of an axis for times (k,), s, which are since 1970, UTC, if `dated`; NaN times do not count."""
     known = np.asarray(times, dtype=float)
     known = known[np.isfinite(known)]
-    if len(known) and known.min() >= FIRST_DATE:
+    if len(known) and dated:
         from matplotlib import dates
 
         # The setting `date.epoch` of matplotlib decides which day is 0.

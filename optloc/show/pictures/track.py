@@ -115,7 +115,8 @@ def plot_tracks(drawn: Sequence[PlottedTrack], title: str = "") -> Figure:
     names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]
     figure = figure_class()(figsize=(WIDE, 2.4 + 2.2 * len(names)), layout="constrained")
     panels = figure.subplot_mosaic([["plan", name] for name in names])
-    scale = time_scale(np.concatenate([line.times for line in lines]))
+    dated = all(each.problem.dated for each in drawn)
+    scale = time_scale(np.concatenate([line.times for line in lines]), dated=dated)
     draw_plan(panels["plan"], lines, stations, axes, drawn[0].problem.stations.names)
     if "height" in panels:
         draw_heights(panels["height"], lines, axes[2], scale)

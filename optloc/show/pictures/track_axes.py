@@ -53,7 +53,7 @@ def track_axes(
     stations, axes = np.zeros((0, d)), ("x", "y", "z")[:d]
     if problem is not None:
         lines, stations, axes = turned(lines, problem)
-    scale = time_scale(track.times)
+    scale = time_scale(track.times, dated=track.dated)
     if what == "plan":
         draw_plan(panel, lines, stations, axes, () if problem is None else problem.stations.names)
         place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}

@@ -68,7 +68,9 @@ def on_earth(status="ok", chart="cartesian", **more):
     """Return a row in ECEF whose covariance is `ENU` along east, north and up."""
     axes = level_axes(LAT, LON)
     place = np.array(pymap3d.geodetic2ecef(LAT, LON, HEIGHT))
-    return Results(columns_of(ECEF, place, axes.T @ ENU @ axes, status, chart, **more), ECEF, title="site <&>")
+    return Results(
+        columns_of(ECEF, place, axes.T @ ENU @ axes, status, chart, **more), ECEF, title="site <&>", dated=True
+    )
 
 
 def ambiguous():

@@ -20,11 +20,11 @@ def test_an_ellipse_has_the_bearing_of_its_long_axis(bearing):
     assert (found[2] - bearing + 90.0) % 180.0 == pytest.approx(90.0, abs=1e-9)
 
 
-def mark(status="ok", time=np.nan, velocity=None):
+def mark(status="ok", time=np.nan, velocity=None, dated=False):
     place = ECEF.from_geodetic(np.radians(47.0), np.radians(8.0), 400.0)
     axes = ECEF.enu_axes(place)
     cov = axes.T @ np.diag([1.0, 4.0, 9.0]) @ axes
-    return mark_of(ECEF, place, cov, status, velocity=velocity, name="m", target="m", time=time)
+    return mark_of(ECEF, place, cov, status, velocity=velocity, name="m", target="m", time=time, dated=dated)
 
 
 def test_a_mark_is_level_on_earth():
@@ -32,7 +32,7 @@ def test_a_mark_is_level_on_earth():
     assert found.place == pytest.approx([8.0, 47.0, 400.0])
     assert found.level == pytest.approx(np.diag([1.0, 4.0, 9.0]), abs=1e-9)
     assert found.velocity == pytest.approx([0.0, 5.0, 0.0], abs=1e-12)
-    assert found.words.startswith(f"ok. {Status.OK.sentence} latitude: 47.0000000 deg")
+    assert found.words.startswith(f"ok. {Status.OK.sentence} latitude: 47.000000")
     assert "sigma east, north, up: 1, 2, 3 m" in found.words
 
 
@@ -42,9 +42,11 @@ def test_what_is_not_ok_has_a_position_without_a_covariance():
     assert "if this position is correct" in found.words
 
 
-def test_large_times_are_dates():
-    assert mark(time=5.0).date is None
-    assert mark(time=1_700_000_000.5).date.isoformat() == "2023-11-14T22:13:20.500000+00:00"
+def test_only_times_since_1970_are_dates():
+    assert mark(time=1_700_000_000.5).date is None
+    assert mark(dated=True).date is None
+    assert mark(time=1_700_000_000.5, dated=True).date.isoformat() == "2023-11-14T22:13:20.500000+00:00"
+    assert mark(time=-86400.0, dated=True).date.isoformat() == "1969-12-31T00:00:00+00:00"
 
 
 def test_geojson_has_stations_fix_and_an_ellipse_that_holds_the_fix():

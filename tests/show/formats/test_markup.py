@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from show.ranging import ENU, ranged
 
+from optloc import InvalidProblem
 from optloc.show.columns import fix_columns
 from optloc.show.formats.marks import Results, mark_of
-from optloc.show.formats.markup import event, gpx, kml
+from optloc.show.formats.markup import cot, event, gpx, kml
 
 KML, GPX = "{http://www.opengis.net/kml/2.2}", "{http://www.topografix.com/GPX/1/1}"
 
@@ -37,18 +38,26 @@ def test_kml_has_the_place_of_each_station_and_fix():
             ["2026-07-01T10:00:00", "2026-07-01T10:00:05"],
         ),
         (["first", "second"], [1782900000.0, 1782900005.25], ["first", "second"]),
-        (["0", "5"], [0.0, 5.0], ["0", "5"]),
     ],
 )
 def test_an_epoch_without_a_label_is_named_by_its_date(epochs, times, names):
     columns = {name: np.repeat(values, 2) for name, values in fix_columns(ranged()[1]).items()}
     columns |= {"epoch": np.array(epochs, dtype=object), "time": np.array(times)}
-    found = [mark.name for mark in Results(columns, ENU).marks()]
+    found = [mark.name for mark in Results(columns, ENU, dated=True).marks()]
     assert all(name.startswith(start) for name, start in zip(found, names, strict=True)), found
+    assert [mark.name for mark in Results(columns, ENU).marks()] == epochs
+
+
+def test_seconds_without_a_scale_are_no_dates():
+    columns = {**fix_columns(ranged()[1]), "time": np.array([1.4e9])}
+    assert ET.fromstring(gpx(Results(columns, ENU))).find(f".//{GPX}time") is None
+    with pytest.raises(InvalidProblem, match="Cursor on Target needs dates, but the times have no time scale"):
+        cot(Results(columns, ENU))
+    assert cot(Results({**columns, "time": np.array([np.nan])}, ENU))
 
 
 def test_a_height_of_zero_has_no_sign():
-    level = mark_of(ENU, np.array([0.0, 0.0, -400.0001]), np.eye(3), "ok", name="m", target="m", time=1_700_000_000.0)
+    level = mark_of(ENU, np.array([0.0, 0.0, -400.0001]), np.eye(3), "ok", name="m", target="m", time=np.nan)
     assert level.place[2] < 0.0
     assert ET.fromstring(event(level)).find("point").get("hae") == "0.000"
 
@@ -63,7 +72,7 @@ def test_gpx_has_the_covariance_along_east_and_north():
 
 
 def test_an_event_has_errors_and_course_or_their_sign_of_unknown():
-    about = {"name": "m", "target": "m", "time": 1_700_000_000.0}
+    about = {"name": "m", "target": "m", "time": 1_700_000_000.0, "dated": True}
     sure = mark_of(ENU, np.zeros(3), np.diag([9.0, 4.0, 1.0]), "ok", velocity=np.array([3.0, 4.0, 0.0]), **about)
     found = ET.fromstring(event(sure))
     assert (found.get("type"), found.get("start")) == ("a-u-G", "2023-11-14T22:13:20.000Z")

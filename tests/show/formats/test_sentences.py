@@ -28,7 +28,7 @@ def test_minutes_never_reach_sixty(degrees, digits, text):
 
 def mark(status="ok"):
     cov = np.diag([9.0, 4.0, 1.0])
-    return mark_of(ENU, np.array([0.0, 0.0, 7.0]), cov, status, name="m", target="m", time=1_700_000_000.25)
+    return mark_of(ENU, np.array([0.0, 0.0, 7.0]), cov, status, name="m", target="m", time=1_700_000_000.25, dated=True)
 
 
 def test_sentences_have_their_checksum_place_and_errors():

@@ -47,7 +47,7 @@ def test_biases_are_in_the_unit_of_the_file_with_their_final_value():
     sigma = np.array([[9.0], [0.6], [np.nan]])
     values = np.array([[3.0], [30.0], [np.nan]])
     layout = SimpleNamespace(shared=(slot,))
-    found = SimpleNamespace(layout=layout, times=np.arange(3.0), take=lambda name: (values, sigma))
+    found = SimpleNamespace(layout=layout, times=np.arange(3.0), dated=False, take=lambda name: (values, sigma))
     (panel,) = plot_biases(found, units={"clock": ("ns", 0.3)}, truth={"clock": np.array([27.0])}).axes
     assert panel.get_ylabel() == "estimate with 95 % interval (ns)"
     assert panel.get_legend().get_texts()[0].get_text() == "R2: 100.0 ± 2.0 ns"

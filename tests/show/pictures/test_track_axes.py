@@ -24,7 +24,7 @@ def moving(start=0.0, batch=()):
     shape = (*batch, k)
     zeros = np.zeros(shape)
     code = np.zeros(shape, dtype=int)
-    return Track(start + np.arange(k), mean, cov, zeros + 3.0, code + 4, zeros, code, 2)
+    return Track(start + np.arange(k), mean, cov, zeros + 3.0, code + 4, zeros, code, 2, start > 0.0)
 
 
 def test_the_plan_starts_at_the_first_known_state():
