@@ -48,7 +48,7 @@ def with_sigma(value: float, sigma: float, unit: str) -> str:
     """
     unit = unit if unit != "1" else ""
     if sigma <= _HELD * (1.0 + abs(value)):
-        return f"{value:.10g} {unit} (held)"
+        return f"{f'{value:.10g} {unit}'.rstrip()} (held)"
     if not np.isfinite(sigma):
         return f"{value:.6g} {unit}"
     # Print two digits of the standard deviation, and no decimals if it is 10 or more.

@@ -59,6 +59,7 @@ from optloc.solvers.certificates.branch_and_bound import (
     unknown_claim,
 )
 from optloc.solvers.certificates.known_positions import certified_linear, is_linear
+from optloc.solvers.certificates.known_targets import certified_alone, has_known_target
 from optloc.solvers.certificates.moving_medium import certified_at_rest, problem_at_rest
 from optloc.solvers.certificates.out_of_reach import edges_of, out_of_reach
 from optloc.solvers.certificates.position_cost import (
@@ -98,6 +99,8 @@ def certified(
     """
     if pool is not None and not pool.loss and region is None and is_linear(problem):
         return certified_linear(problem, pool, margin)
+    if pool is not None and not pool.loss and has_known_target(problem):
+        return certified_alone(problem, pool, certified, region, margin, effort)
     still = problem_at_rest(problem)
     if still is not None and pool is not None and not pool.loss:
         return certified_at_rest(problem, pool, still, certified, region, margin, effort)
