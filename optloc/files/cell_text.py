@@ -20,7 +20,7 @@ from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.columns import unit_of
 from optloc.files.roles import Roles
-from optloc.files.table import Table
+from optloc.files.table import Table, number_advice
 
 # Integers up to 2^53 and powers of ten up to 10^22 are exact as floats. Their quotient is then the nearest float.
 _EXACT, _EXACT_PLACES = 2**53, 22
@@ -228,7 +228,7 @@ def _number(table: Table, name: str, row: int, cell: Any) -> Decimal | None:
     if number.is_finite() and abs(number) <= LARGEST and -int(number.as_tuple().exponent) <= _DIGITS:
         return number
     what = f"{text[:40]!r} is not a finite number"
-    raise InvalidProblem(what, table.where(name, row), "correct it, or empty the cell")
+    raise InvalidProblem(what, table.where(name, row), number_advice(text, "correct it, or empty the cell"))
 
 
 def is_dated(table: Table, name: str) -> bool:

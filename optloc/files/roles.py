@@ -330,12 +330,14 @@ class ColumnPlaces:
 
     columns: columns of a stations table (s,), such as name, x, y, z or name, lat_deg, lon_deg, height. frame:
     "cartesian", "ecef" or "geodetic". unit: unit of lengths. note: assumptions about names and heights, or empty.
+    source: name of the table, for messages; empty if it is unknown.
     """
 
     columns: Mapping[str, Array]
     frame: str
     unit: str = "m"
     note: str = ""
+    source: str = ""
 
     @property
     def names(self) -> list[str]:
@@ -360,7 +362,8 @@ def places_of(path: Path | Table, stated: Mapping[str, str], frame: str | None) 
 def _of_table(table: Table, stated: Mapping[str, str], frame: str | None) -> ColumnPlaces:
     """Return the stations of a table; arguments as for `places_of`."""
     roles, note = _with_names(Roles.of(table, stated))
-    found = _noted(placed(roles, frame), note)
+    found = replace(_noted(placed(roles, frame), note), source=roles.table.source)
+    _check_names(roles, found.names)
     column = roles.find("heading")
     if column is not None:
         factor = UNITS["angle"][unit_of(column, UNITS["angle"]) or "deg"] / UNITS["angle"]["deg"]
@@ -368,6 +371,15 @@ def _of_table(table: Table, stated: Mapping[str, str], frame: str | None) -> Col
         found = replace(found, columns={**found.columns, **headings})
     check_column_hints(roles, ("name", "heading", *place_roles(roles)))
     return found
+
+
+def _check_names(roles: Roles, names: Sequence[str]) -> None:
+    """Raise InvalidProblem for a station name that occurs twice in a table; `names` (s,) are the names of its rows."""
+    first: dict[str, int] = {}
+    for row, name in enumerate(names):
+        if first.setdefault(name, row) != row:
+            where = roles.table.where(roles.column("name"), row)
+            raise InvalidProblem(f"the station {name!r} occurs twice", where, "give each station its own name")
 
 
 def _with_names(roles: Roles) -> tuple[Roles, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from csv import Error as CSVError, reader as lines_of
@@ -190,7 +191,19 @@ class Table:
         if not isinstance(cell, bool) and "_" not in str(cell):
             with suppress(TypeError, ValueError, OverflowError):
                 return float(cell)
-        raise InvalidProblem(f"{cell!r} is not a number", self.where(key, row), "give a number")
+        raise InvalidProblem(f"{cell!r} is not a number", self.where(key, row), number_advice(cell, "give a number"))
+
+
+# A number with a decimal comma, of a length that fits a message.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,9},\d{1,9}")
+
+
+def number_advice(cell: object, usual: str) -> str:
+    """Return the next step for a cell that is not a number: a decimal point for a comma, else `usual`."""
+    text = str(cell).strip()
+    if _DECIMAL_COMMA.fullmatch(text) is None:
+        return usual
+    return f"write decimal points in all cells, such as {text.replace(',', '.')}"
 
 
 # Years from 1970 that fit into 64-bit nanoseconds; numpy overflows beyond to an earlier century.

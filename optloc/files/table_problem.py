@@ -143,7 +143,7 @@ class TableProblem:
         if option is not None:
             return option
         if where.startswith(names[0]):
-            return where.replace(names[0], f"stations of {self.source.name}", 1)
+            return where.replace(names[0], self.places.source or f"stations of {self.source.name}", 1)
         return self.source.name
 
     def write(self, out: Path) -> tuple[Path, ...]:

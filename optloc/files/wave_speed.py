@@ -85,6 +85,10 @@ def is_profile(text: Any) -> bool:
     return isinstance(text, str) and text.strip().lower().endswith(_PROFILES)
 
 
+# Units of a text that states a temperature without its medium.
+_TEMPERATURES = ("C", "°C", "degC")
+
+
 def stated_speed(text: str, where: str) -> StatedSpeed:
     """Return the wave speed of a text.
 
@@ -135,6 +139,8 @@ def _positive(text: str, unit: str | None, given: str, where: str) -> float:
     # a bare number is in metres per second, as in a file
     name = match[2] or unit or "m/s"
     if name not in UNITS["speed"] or name == "Hz":
+        if name in _TEMPERATURES:
+            raise InvalidProblem(f"{given!r} is a temperature", where, f'name the medium, such as "air:{given}"')
         known = [other for other in UNITS["speed"] if other != "Hz"]
         raise InvalidProblem(f"{name!r} is not a unit of speed", where, nearest(name, known))
     speed = float(Units("speed").conversion(name, where).to_si(float(match[1])))

@@ -60,3 +60,11 @@ def test_other_words_of_station_tables_become_our_names():
     found = with_standard_columns(table(receiver="A", latitude=1.0, longitude=2.0, altitude_km=0.5), "m")
     assert found.raw("name").tolist() == ["A"]
     assert [found.numbers(key).tolist() for key in ("lat_deg", "lon_deg", "height")] == [[1.0], [2.0], [500.0]]
+
+
+def test_a_station_that_occurs_twice_is_named_by_its_row():
+    rows = [{"name": name, "x": 1.0 * i, "y": 0.0} for i, name in enumerate(["A", "B", "A"])]
+    with pytest.raises(InvalidProblem, match="the station 'A' occurs twice; give each station its own name") as refused:
+        places_of(of_rows(rows, "anchors.csv", {}), {}, None)
+    assert refused.value.where == "anchors.csv, row 3, column 'name'"
+    assert places_of(of_rows(rows[:2], "anchors.csv", {}), {}, None).source == "anchors.csv"

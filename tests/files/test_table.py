@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from optloc import InvalidProblem
-from optloc.files.table import csv, of_frame, of_rows, parquet
+from optloc.files.table import csv, number_advice, of_frame, of_rows, parquet
 
 
 def test_rows_frames_and_files_hold_the_same_cells(tmp_path):
@@ -32,6 +32,15 @@ def test_a_cell_without_a_number_is_named_by_row_and_column(cell, words):
         table.numbers("z")
     assert "row 2" in refused.value.where
     assert "'z'" in refused.value.where
+
+
+def test_a_decimal_comma_has_its_next_step():
+    table = of_rows([{"z": "55,2"}, {"z": "1,234.5"}], "rows", {})
+    with pytest.raises(
+        InvalidProblem, match=r"'55,2' is not a number; write decimal points in all cells, such as 55.2"
+    ):
+        table.numbers("z")
+    assert number_advice("1,234.5", "give a number") == "give a number"
 
 
 def test_rows_that_were_taken_keep_their_numbers_in_messages():

@@ -62,6 +62,7 @@ WRONG = {
     "fire:3": "no medium 'fire'",
     "fast": "no wave speed",
     "343 ns": "not a unit of speed",
+    "28C": 'name the medium, such as "air:28C"',
     "343 Hz": "not a unit of speed",
     "-3 m/s": "not positive",
     "343+-0 m/s": "not positive",

@@ -496,7 +496,10 @@ def _show_pairs(pairs: list[Any], console: Console) -> None:
         table = []
         for pair in rows:
             # The interval is below the median: side by side, two of them do not fit in 80 characters.
-            medians = (f"{one.value:.2g}\n[{one.low:.2g}, {one.high:.2g}]" for one in (pair.error, pair.time))
+            medians = (
+                "-" if isnan(one.value) else f"{one.value:.2g}\n[{one.low:.2g}, {one.high:.2g}]"
+                for one in (pair.error, pair.time)
+            )
             only = f"{pair.alone} : {pair.other_alone}"
             table.append((pair.method, str(pair.trials), only, f"{pair.p:.2g}", *medians))
         show_sheet(FixSheet("", ("method", *heads), table), console)

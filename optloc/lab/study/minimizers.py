@@ -44,7 +44,11 @@ class Minimizer:
         for _ in range(weighings(drawn.problem)):
             weighted = weighed_at(drawn.problem, x, start)
             for i in range(len(x)):
-                x[i] = self.function(cost_of(weighted.take(np.array([i])), teller(i)), x[i].copy())
+                answer = np.asarray(self.function(cost_of(weighted.take(np.array([i])), teller(i)), x[i].copy()))
+                if answer.shape != x[i].shape:
+                    what = f"the method returned an array of shape {answer.shape}, not the vector {x[i].shape}"
+                    raise InvalidProblem(what, "method", "return the vector of unknowns, as minimize(...).x")
+                x[i] = answer
         return claim(drawn.problem, start, x)
 
 
@@ -104,9 +108,9 @@ def baseline_of(name: str) -> Baseline:
         raise InvalidProblem(f"unknown baseline {name!r}", "baseline", nearest(name, list(BASELINES)))
     function = getattr(module, function_name, None)
     if not callable(function):
-        known = [
-            attribute for attribute, value in vars(module).items() if callable(value) and not attribute.startswith("_")
-        ]
+        # Imported functions, such as `minimize`, are not methods of the file.
+        own = {key: value for key, value in vars(module).items() if callable(value) and not key.startswith("_")}
+        known = [key for key, value in own.items() if getattr(value, "__module__", module.__name__) == module.__name__]
         raise InvalidProblem(f"there is no function {function_name!r}", place, nearest(function_name, known))
     if isinstance(function, Baseline):
         return function

@@ -4,7 +4,7 @@ The rows of a known target are linear in the biases b that it shares with the un
 
     |A b + E e - v|^2 + |R (b - mean)|^2,
 
-with whitened rows A and E. R are the rows of the prior, and e are the emission times of the known targets. Minimised over
+with whitened rows A and E. R are the rows of the prior, and e are emission times of the known targets. Minimised over
 e, it is a constant plus ``|L (b - b0)|^2``: a joint Gaussian prior of the biases. Its eigenvectors are combinations of
 biases that are independent a priori. The lone problem has the rows of the unknown target, with these combinations as
 offsets. Its cost and the cost of the whole problem differ by the constant, so a claim is valid for both.
@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -231,7 +232,7 @@ def _shared_columns(layout: Layout, names: set[str]) -> Array:
 def _local_columns(layout: Layout, name: str, epochs: Array) -> list[int]:
     """Return the columns of a local unknown of one number at some epochs."""
     slot, _ = layout.find(name)
-    return (layout.n_shared + epochs * layout.n_local + slot.start).tolist()
+    return [int(column) for column in layout.n_shared + epochs * layout.n_local + slot.start]
 
 
 def _of_target(problem: Problem, target: int, own: Array) -> Problem:
@@ -251,7 +252,7 @@ def _of_target(problem: Problem, target: int, own: Array) -> Problem:
     old, new = (state_names(*each, motion.order) for each in ((target, len(problem.motions)), (0, 1)))
     priors = tuple(replace(p, name=new[old.index(p.name)]) for p in problem.priors if p.name in old)
     constraints = tuple(for_target(c, 0) for c in problem.constraints if c.target == target)
-    unknowns = {"motions": (motion,), "biases": (), "priors": priors, "constraints": constraints}
+    unknowns: dict[str, Any] = {"motions": (motion,), "biases": (), "priors": priors, "constraints": constraints}
     return replace(problem, rows=rows, noise=Noise(tuple(blocks)), **unknowns)
 
 

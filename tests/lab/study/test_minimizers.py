@@ -3,6 +3,7 @@
 import json
 from importlib.resources import files
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from recipes import files_of_the_page
 from scipy.optimize import minimize
 from typer.testing import CliRunner
 
+import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.kernels.sums import equations_at
@@ -103,6 +105,13 @@ def test_what_cannot_be_loaded_is_a_sentence(mine, tmp_path):
             added([name])
     assert added(["gtrs+lsr", "taylor"])[1].baseline == "taylor"
     assert baseline_of(f"{mine}:bfgs").summary == "BFGS with the gradient, as SciPy has it."
+
+
+def test_a_method_without_a_vector_has_a_sentence(monkeypatch):
+    drawn = SimpleNamespace(problem=optloc.load(files("optloc") / "scenarios" / "demo.toml").flat())
+    start = np.zeros((1, drawn.problem.layout.size))
+    with pytest.raises(InvalidProblem, match=r"returned an array of shape \(2,\), not the vector \(3,\)"):
+        Minimizer(lambda cost, x: x[:2])(drawn, start)
 
 
 # What is known beforehand of a clock, of the place, and of the emission of each pulse: all of it is part of the cost.
