@@ -69,7 +69,7 @@ def test_the_page_of_a_fix_has_status_coordinates_and_sigma_without_scripts():
     page = re.sub(r"<script.*?</script>", "", fix_page(problem, fix, "Four ranges"), flags=re.DOTALL)
     lat, lon, _ = np.degrees(fix.geodetic)
     assert '<span class="status">ok</span>' in page
-    assert f"<code>{lat:.5f}, {lon:.5f}</code>" in page
+    assert f"<code>{lat:.6f}, {lon:.6f}</code>" in page
     assert "sigma east, north: 1" in page
     assert re.search(r'<title id="map-1-title">Four ranges</title><desc id="map-1-about">Map of 4 stations', page)
     assert "<b>S1</b>" in page or "<b>1</b>" in page
