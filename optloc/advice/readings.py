@@ -284,10 +284,12 @@ def _is_time(size: float, speed: float) -> bool:
 def coordinate_units(case: MisfitCase, suspects: Suspects) -> Iterator[Change]:
     """Yield other units of the coordinates of the stations."""
     place = case.base.stations.position
-    if case.base.frame.geodetic or not case.present[:, case.rows_where("length")].any():
+    written = case.base.written
+    numbers = written is not None and written.place_keys[:1] == ("x",)  # no latitudes and longitudes
+    if (case.base.frame.geodetic and not numbers) or not case.present[:, case.rows_where("length")].any():
         return
     sizes = [UNITS["length"][unit] for unit in _COORDINATE_UNITS]
-    for factor in (*sizes, *(1.0 / size for size in sizes)):
+    for factor in dict.fromkeys([*sizes, *(1.0 / size for size in sizes)]):
         words = partial(_coordinate_words, case, factor)
         yield Change("coordinate-unit", words, position=place * factor, alternatives=2 * len(sizes))
 

@@ -21,6 +21,8 @@ from optloc.problem.noise import variances
 
 # Epochs with the largest cost whose rows may be outliers, and the largest number of rows of which pairs are tried.
 _EPOCHS, _PAIRED = 3, 12
+# Excess of the cost of an epoch over its degrees of freedom below which no row of it is an outlier: a price is larger.
+_FITS = 9.0
 # Factors of the noise that are tried; between two of them, the likelihood changes by less than one.
 _LEVELS = tuple((1.5 * 1.5**i) for i in range(14))
 # A station needs this number of rows for a noise level: fewer rows do not distinguish noise from outliers.
@@ -73,7 +75,10 @@ def _worst_rows(case: MisfitCase) -> list[tuple[int, int]]:
         white = whitener.apply(linear.residual[..., None])[..., 0]
         size[:, whitener.row.ravel()] = np.abs(white)
     size = np.where(np.isfinite(size), size, 0.0)
-    epochs = np.argsort(-(size**2).sum(1), kind="stable")[:_EPOCHS]
+    excess = (size**2).sum(1) - case.dof
+    epochs = np.argsort(-excess, kind="stable")[:_EPOCHS]
+    # an epoch that fits would only take the place of rows of the others
+    epochs = [k for i, k in enumerate(epochs) if i == 0 or excess[k] > _FITS]
     # a gross row enlarges all residuals of its epoch, so that the rows of each epoch are ordered separately
     orders = [[(int(k), int(i)) for i in np.argsort(-size[k], kind="stable") if case.present[k, i]] for k in epochs]
     rows = [order[i] for i in range(case.base.count) for order in orders if i < len(order)]

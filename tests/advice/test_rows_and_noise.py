@@ -6,7 +6,10 @@ import numpy as np
 from advice.cases import TRUTHS, at, range_case
 
 from optloc.advice.causes import causes_of
-from optloc.advice.rows_and_noise import late_fit
+from optloc.advice.change import Change
+from optloc.advice.fits import fit
+from optloc.advice.rows_and_noise import _worst_rows, late_fit
+from optloc.advice.wording import no_words
 
 
 def test_one_wrong_row_of_several_epochs_is_an_outlier():
@@ -36,3 +39,13 @@ def test_late_rows_have_a_positive_delay():
     found = late_fit(replace(case, x=TRUTHS))
     assert 0.1 < found.share < 0.6
     assert 20.0 < found.delay < 120.0
+
+
+def test_epochs_that_fit_have_no_wrong_rows():
+    error = np.zeros((4, 7))
+    error[2, [1, 5]] = 80.0, -60.0
+    case, _ = range_case(error, epochs=4)
+    case = replace(case, x=fit(case, [Change("none", no_words)]).x[0])
+    rows = _worst_rows(case)
+    assert {epoch for epoch, _ in rows} == {2}
+    assert {row for _, row in rows} == set(range(7))
