@@ -76,9 +76,9 @@ def _worst_rows(case: MisfitCase) -> list[tuple[int, int]]:
         size[:, whitener.row.ravel()] = np.abs(white)
     size = np.where(np.isfinite(size), size, 0.0)
     excess = (size**2).sum(1) - case.dof
-    epochs = np.argsort(-excess, kind="stable")[:_EPOCHS]
+    worst = np.argsort(-excess, kind="stable")[:_EPOCHS]
     # an epoch that fits would only take the place of rows of the others
-    epochs = [k for i, k in enumerate(epochs) if i == 0 or excess[k] > _FITS]
+    epochs = [k for i, k in enumerate(worst.tolist()) if i == 0 or excess[k] > _FITS]
     # a gross row enlarges all residuals of its epoch, so that the rows of each epoch are ordered separately
     orders = [[(int(k), int(i)) for i in np.argsort(-size[k], kind="stable") if case.present[k, i]] for k in epochs]
     rows = [order[i] for i in range(case.base.count) for order in orders if i < len(order)]

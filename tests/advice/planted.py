@@ -197,7 +197,10 @@ def _error(rng: np.random.Generator, data: Data) -> tuple[float, float]:
 def offset(rng: np.random.Generator, scene: Scene, data: Data) -> Planted:
     who = _guilty(rng, data)
     size, error = _error(rng, data)
-    return replace(data, z=data.z + np.where(_channel(data, who), error, 0.0)), (who,), size
+    rows = _channel(data, who)
+    if data.kind[0] in ("range", "range_sum") and (data.z + error)[:, rows].min() < 0.0:
+        size, error = abs(size), abs(error)  # a negative range is refused before the fix
+    return replace(data, z=data.z + np.where(rows, error, 0.0)), (who,), size
 
 
 def _channel(data: Data, who: int) -> Array:
