@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -17,14 +16,6 @@ from optloc.partitions import executors
 from optloc.partitions.executors import TASK_EXECUTORS, Died, TaskExecutor, task_executor
 
 FEW = range(5)
-ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def importable(monkeypatch):
-    """Let workers import the functions of this module; they get the path of this process, or the environment."""
-    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT)])
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
 def square(number):

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -203,11 +202,10 @@ def fix_or_die(task):
 @pytest.mark.parametrize(
     ("name", "package"), [("dask", "distributed"), pytest.param("ray", "ray", marks=pytest.mark.slow)]
 )
-def test_a_cluster_that_loses_a_worker_writes_the_same_bytes(tmp_path, monkeypatch, name, package):
+def test_a_cluster_that_loses_a_worker_writes_the_same_bytes(tmp_path, monkeypatch, importable, name, package):
     """`test_a_worker_that_is_killed_in_the_middle_changes_nothing` and the benchmark have larger data sets."""
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))  # of Ray's workers
     folder, sites = write(tmp_path / "readings", 6)
     fix_data_set(folder, tmp_path / "one", options_of(sites), HERE)
     monkeypatch.setattr(module, "fix_partition", fix_or_die)

@@ -190,7 +190,7 @@ def _joint_prior(
     size = np.linalg.norm(np.concatenate([A, jacobian[:, shared]]), axis=0)
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh((A / size).T @ (A / size))
-    values = np.where(values > _OPEN * max(values[-1], _OPEN), values, 0.0)
+    values = np.where(values > _OPEN * values.max(initial=_OPEN), values, 0.0)
     combine = vectors / size[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.where(values > 0.0, (combine.T @ (A.T @ v)) / values, 0.0)
