@@ -25,7 +25,7 @@ def settings(_):
 
 
 @pytest.mark.slow
-def test_local_workers_do_not_return_memory_after_each_array(monkeypatch):
+def test_local_workers_do_not_return_memory_after_each_array(monkeypatch, importable):
     """Otherwise fixes take 1.3 times as long. The settings of the program do not change."""
     pytest.importorskip("distributed")
     import dask
