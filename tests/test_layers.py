@@ -165,7 +165,7 @@ def test_no_loose_module_except_the_entry_point_of_the_command_line():
 
 
 # Limits of the contributing guide. A commit that adds a file raises the number of modules, so that each is a decision.
-MODULES, LINES, BODY, RECURRING = 622, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 623, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -562,7 +562,7 @@ def tried_before(pool: Pool, fix: Fix, items: Array) -> TriedBefore | None:
     """Return the proofs tried for fixes `items` of a pool, for a later stage; None without tried proofs."""
     if pool.proven is None:
         return None
-    return TriedBefore(fix.cost[items], _count_listed(fix)[items], take(pool.proven, items))
+    return TriedBefore(fix.cost[items], count_listed(fix)[items], take(pool.proven, items))
 
 
 def claims_before(pool: Pool) -> Claims:
@@ -570,7 +570,7 @@ def claims_before(pool: Pool) -> Claims:
     return empty_claims(len(pool)) if pool.proven is None else change(pool.proven, lambda array, core: np.array(array))
 
 
-def _count_listed(fix: Fix) -> Array:
+def count_listed(fix: Fix) -> Array:
     """Return the number of listed alternatives of each fix, (N,)."""
     return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
@@ -590,7 +590,7 @@ def _is_still_valid(before: TriedBefore | None, fix: Fix) -> Array:
     """
     if before is None:
         return np.zeros(len(fix.x), dtype=bool)
-    alike = (before.listed == _count_listed(fix)) & (np.abs(fix.cost - before.cost) <= equal_cost(fix.cost))
+    alike = (before.listed == count_listed(fix)) & (np.abs(fix.cost - before.cost) <= equal_cost(fix.cost))
     return np.asarray(before.proven.tried & alike)
 
 

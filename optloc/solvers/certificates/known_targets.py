@@ -36,14 +36,12 @@ from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.noise import Block, Noise, whiten, whiten_rows
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import (
-    LOST,
     certify_stage,
     claims_before,
     fixes_to_prove,
     keep_evidence,
-    unknown_claim,
 )
-from optloc.solvers.policy import equal_cost
+from optloc.solvers.certificates.mapped_claims import claims_so_far, drop_lost, improved
 from optloc.solvers.pool import Pool, offer
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge
@@ -292,9 +290,7 @@ def certified_alone(
     """
     began, fix, stages = perf_counter(), judge(problem, pool), pool.stages
     asked, proven_before = fixes_to_prove(pool, fix)
-    claims = claims_before(pool)
-    if pool.tried_before is not None:
-        claims.write(proven_before, take(pool.tried_before.proven, proven_before))
+    claims = claims_so_far(pool, proven_before)
     detail = "nothing to prove"
     for item in np.flatnonzero(asked & ~proven_before)[:, None]:
         part, before, old = problem.take(item), take(pool, item), fix[item]
@@ -304,18 +300,11 @@ def certified_alone(
         new = offer(part, lone.together(done.x, old.x[0]), before, "certify", began)
         new = keep_evidence(lsr(part, new), before)
         judged, found = judge(part, new), judge(lone.problem, done)
-        with np.errstate(invalid="ignore"):
-            better = (judged.cost < old.cost - equal_cost(old.cost)) | (_listed(judged) > _listed(old))
-        changed = np.flatnonzero(better)
+        changed = improved(old, judged)
         pool = pool.merge(item[changed], take(new, changed))
         claims.write(item, _claims_together(overwrite(old, changed, judged[changed]), found, done, lone))
         detail = f"{done.stages[-1].detail}, with known targets as a prior"
     return replace(pool, proven=claims, stages=(*stages, certify_stage(detail, began)))
-
-
-def _listed(fix: Fix) -> Array:
-    """Return the number of listed alternatives of each fix, (N,)."""
-    return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 
 def _claims_together(fix: Fix, found: Fix, done: Pool, lone: LoneProblem) -> Claims:
@@ -325,7 +314,5 @@ def _claims_together(fix: Fix, found: Fix, done: Pool, lone: LoneProblem) -> Cla
     """
     claims = claims_before(done)
     claims.bound[:] += lone.constant
-    same = np.abs(fix.cost - found.cost - lone.constant) <= equal_cost(fix.cost)
-    same &= fix.answered & (_listed(fix) == _listed(found))
-    claims.write(~same, unknown_claim(LOST))
+    drop_lost(claims, fix, found, lone.constant)
     return claims

@@ -34,15 +34,14 @@ from optloc.problem.fix import Fix
 from optloc.problem.forms import form_of
 from optloc.problem.problem import Problem
 from optloc.solvers.certificates.branch_and_bound import (
-    LOST,
     certify_stage,
     claim_sentence,
     claims_before,
+    count_listed,
     fixes_to_prove,
     keep_evidence,
-    unknown_claim,
 )
-from optloc.solvers.policy import equal_cost
+from optloc.solvers.certificates.mapped_claims import claims_so_far, drop_lost, improved
 from optloc.solvers.pool import Pool, offer
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge
@@ -185,9 +184,7 @@ def certified_at_rest(
     """
     began, fix, stages = perf_counter(), judge(problem, pool), pool.stages
     asked, proven_before = fixes_to_prove(pool, fix)
-    claims = claims_before(pool)
-    if pool.tried_before is not None:
-        claims.write(proven_before, take(pool.tried_before.proven, proven_before))
+    claims = claims_so_far(pool, proven_before)
     items = np.flatnonzero(asked & ~proven_before)
     if not len(items):
         return replace(pool, proven=claims, stages=(*stages, certify_stage("nothing to prove", began)))
@@ -198,18 +195,12 @@ def certified_at_rest(
     found, old = judge(rest, done), fix[items]
     new = keep_evidence(lsr(part, offer(part, still.in_wind(done.x), before, "certify", began)), before)
     judged = judge(part, new)
-    with np.errstate(invalid="ignore"):
-        changed = np.flatnonzero((judged.cost < old.cost - equal_cost(old.cost)) | (_listed(judged) > _listed(old)))
+    changed = improved(old, judged)
     pool = pool.merge(items[changed], take(new, changed))
     now = overwrite(old, changed, judged[changed])
     claims.write(items, _claims_in_wind(now, found, done, still))
     detail = f"{done.stages[-1].detail}, in coordinates without wind"
     return replace(pool, proven=claims, stages=(*stages, certify_stage(detail, began)))
-
-
-def _listed(fix: Fix) -> Array:
-    """Return the number of listed alternatives of each fix, (N,)."""
-    return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 
 def _claims_in_wind(fix: Fix, found: Fix, done: Pool, still: StillProblem) -> Claims:
@@ -223,8 +214,6 @@ def _claims_in_wind(fix: Fix, found: Fix, done: Pool, still: StillProblem) -> Cl
             continue
         low, high = still.inside(*(np.array(corner) for corner in claims.region[i]))
         claims.region[i] = region = tuple(low.tolist()), tuple(high.tolist())
-        claims.reason[i] = claim_sentence(float(claims.margin[i]), int(_listed(found)[i]), region)
-    same = np.abs(fix.cost - found.cost) <= equal_cost(found.cost)
-    same &= fix.answered & (_listed(fix) == _listed(found))
-    claims.write(~same, unknown_claim(LOST))
+        claims.reason[i] = claim_sentence(float(claims.margin[i]), int(count_listed(found)[i]), region)
+    drop_lost(claims, fix, found)
     return claims
